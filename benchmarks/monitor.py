@@ -6,7 +6,7 @@ One observer is designed for a loop, on a population of 12 drives of its own (se
 Then every seed is a population of the same distribution: 12 drives, 6 episodes of 12 s with and without load each, that the monitor's bounds are found
 on by `fit_monitor`, as a study does; 12 further good drives, 2 episodes of 14 s each, which count false alarms; and one faulty drive of every kind and
 severity, which has ten seconds of motion in each condition to be found. New drives follow other trajectories than those of training. Faults are those of
-the simulator: its badly assembled drive (`draw_parameters`; 1 is its default), all friction times a factor, all harmonics of the gearbox times a factor.
+the simulator: its badly assembled drive (`outlier_severity`; 1 is its default), all friction times a factor, all harmonics of the gearbox times a factor.
 Phases are the simulation's.
 
 Printed are counts over all seeds; rates of false alarms with exact 95 % intervals (binomial a unit, Poisson an hour of motion).
@@ -29,7 +29,7 @@ from kros.design.validation import TrainingSet
 from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
 from kros.observer.simulate import run_innovations
-from kros.plants.harmonic_drive.parameters import DriveParameters, draw_parameters
+from kros.plants.harmonic_drive.parameters import DriveParameters
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 DESIGN_SEED, UNITS, EPISODES, SECONDS, WITHIN_S, RATE = 9041, 12, 6, 12.0, 10.0, 0.02
@@ -50,15 +50,20 @@ class Given(HarmonicDrivePopulation):
 
     drives: DriveParameters | None = None
 
-    def _units(self):
-        return tuple(Unit(f"{k:06d}", "population") for k in range(len(self.drives))), self.drives
+    def units(self):
+        return tuple(Unit(f"{k:06d}", "population") for k in range(len(self.drives))), vars(self.drives)
+
+
+def drawn(seed: int, n_units: int, **outlier: float) -> DriveParameters:
+    """Return the drives of a batch."""
+    return DriveParameters(**HarmonicDrivePopulation(n_units=n_units, seed=seed, **outlier).units()[1])
 
 
 def faulty(seed: int, kind: str, severity: float) -> DriveParameters:
     """Return one faulty drive."""
     if kind == "badly assembled":
-        return draw_parameters(seed, 0, 1.0, severity)
-    good = draw_parameters(seed, 0, 1.0, 0.0)
+        return drawn(seed, 1, outlier=True, outlier_severity=severity).take([0])
+    good = drawn(seed, 1, outlier=True, outlier_severity=0.0).take([0])
     names = FRICTION if kind == "friction" else ("ripple",)
     return replace(good, **{name: getattr(good, name) * severity for name in names})
 
@@ -151,14 +156,14 @@ def main() -> None:
         print(json.dumps({"units": own.monitor.units, "settle_samples": own.monitor.settle}), flush=True)
         count = Count()
         for start in range(0, args.own, 20):
-            drives = draw_parameters(DESIGN_SEED, UNITS + start + 20, 1.0).take(slice(UNITS + start, None))
+            drives = drawn(DESIGN_SEED, UNITS + start + 20).take(slice(UNITS + start, None))
             count.add(levels(own, record(drives, args.first + start, args.loop, NEW_EPISODES, NEW_SECONDS)))
         print(f"{args.loop} own drives: {count}", flush=True)
         return
     count = Count()
     found: dict[tuple, list[bool]] = {}
     for seed in range(args.first, args.first + args.seeds):
-        good = draw_parameters(seed, args.units + UNITS, 1.0)
+        good = drawn(seed, args.units + UNITS)
         kinds = [(kind, s) for kind, severities in FAULTS.items() for s in severities]
         watched = replace(
             observer,

@@ -25,7 +25,7 @@ from kros.observer.estimator.regression import Design, Moments, Readout, Whiteni
 def design(recordings, family="linear", settings=FEW):
     ranges = {"position": (-3.0, 3.0), "u": (-3.0, 3.0)}
     channels = channels_of(LIFTING, (0,), ("u",), family, ranges, settings)
-    return Design(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
+    return Design.of(channels, recordings, settings)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     whitening = Whitening.of(made)
     moments = Moments.of(made, whitening)
     penalty = 1e-6
-    (found,) = moments.solved(whitening, np.ones(len(moments.groups)), [penalty])
+    (found,) = moments.solved(np.ones(len(moments.groups)), [penalty])
     parts: dict = {}
     for key, rows, targets, weights in made.rows(recordings, FEW.rows):
         parts.setdefault(made.groups[key], []).append((rows @ whitening.directions, targets, weights))
@@ -91,13 +91,12 @@ def test_an_exact_plant_is_estimated_exactly(exact):
 def test_reduced_filters_are_stable_at_every_order_and_tend_to_the_bank():
     recordings, batches = plant(units=3, spread=0.2)
     readout = Readout.of(design(recordings))
-    errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2) * recordings.size
     batch = next(iter(batches.values()))
     v = readout.design.channels.signals(batch.states[:, 0, :1], batch.inputs[:, 0], {})
     wanted = readout.design.bank.rows(v, np.arange(len(v))) @ readout.coefficients
     apart = []
     for order in (1, 3, 6, 12):
-        filters = reduced(readout, errors, order, 0.01)
+        filters = reduced(readout, order)
         assert np.abs(np.linalg.eigvals(filters.A)).max() < 1
         z, estimates = filters.S @ v[0], []
         for row in v:
@@ -112,15 +111,15 @@ def test_a_reduction_keeps_its_digits_where_coefficients_cancel():
     recordings, batches = plant(units=3, spread=0.2)
     lifting = replace(LIFTING, functions=("2*position",))
     channels = channels_of(lifting, (0,), ("u",), "linear", {"position": (-3.0, 3.0), "u": (-3.0, 3.0)}, FEW)
-    readout = Readout.of(Design(channels, Bank.of(channels, recordings.length, FEW), recordings, FEW))
-    bank, errors = readout.design.bank, np.exp(np.log(readout.left_out).mean(axis=0) / 2) * recordings.size
+    readout = Readout.of(Design.of(channels, recordings, FEW))
+    bank, errors = readout.design.bank, readout.typical * recordings.size
     batch = next(iter(batches.values()))
     v = channels.signals(batch.states[:, 0, :1], batch.inputs[:, 0], {})
     wanted = bank.rows(v, np.arange(len(v))) @ readout.coefficients
     lag = len(channels) - 1 + bank.delayed * (len(bank.taps) - 2)
     large = readout.coefficients.copy()
     large[lag : lag + 2] += 1e10 * np.outer([2.0, -1.0], errors)
-    filters = reduced(replace(readout, coefficients=large), errors, None, 0.01)
+    filters = reduced(replace(readout, coefficients=large))
     z, estimates = filters.S @ v[0], []
     for row in v:
         estimates.append(filters.C @ z + filters.D @ row)
@@ -139,7 +138,7 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     whitening = Whitening.of(readout.design)
     moments = Moments.of(made, whitening)
     penalty = float(readout.penalties[1])
-    (coefficients,) = moments.solved(whitening, np.ones(len(moments.groups)), [penalty])
+    (coefficients,) = moments.solved(np.ones(len(moments.groups)), [penalty])
     group = readout.design.groups[key]
     np.testing.assert_allclose(
         readout.others[group][:, 1],

@@ -147,11 +147,10 @@ def test_the_bound_is_that_of_one_more_unit():
     found, watches = {}, {unit: Watch(monitor) for unit in population.unit_ids}
     for key, r in records.items():
         watch = watches[key.unit]
-        watch.begin()
         innovation, _ = run_innovations(observer, r[:, None, :1], r[:, None, 3:], settle=0)
         course = []
-        for nu in innovation[:, 0]:
-            watch.take(nu, good=True)
+        for k, nu in enumerate(innovation[:, 0]):
+            watch.take(nu, bad=False, start=k == 0, moving=True)
             course.append(watch.level_db)
         found[key] = max(course)
     peaks = np.array([[v for key, v in found.items() if key.unit == unit] for unit in population.unit_ids])

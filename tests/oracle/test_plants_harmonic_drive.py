@@ -10,12 +10,16 @@ from scipy.integrate import solve_ivp
 
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.dynamics import Physics, simulate
-from kros.plants.harmonic_drive.parameters import GAINS, VELOCITY_POLE, Loop, draw_parameters
+from kros.plants.harmonic_drive.parameters import GAINS, VELOCITY_POLE, DriveParameters, Loop
 from kros.plants.harmonic_drive.reference import MAX_SPEED
 
 PERIOD = 1e-3
 TURN = 20  # samples of a motor revolution at full speed
 SETTLE = 250  # samples
+
+
+def drives_of(seed, n_units, spread=1.0):
+    return DriveParameters(**HarmonicDrivePopulation(n_units=n_units, seed=seed, spread=spread).units()[1])
 
 
 @pytest.fixture(scope="module", params=["stiff", "soft"])
@@ -111,7 +115,7 @@ def right_hand_side(p, moment, link, u):
 
 @pytest.mark.parametrize("loaded", [0.0, 1.0])
 def test_physics_agree_with_a_general_integrator(loaded):
-    p = draw_parameters(8, 1, 2.0)
+    p = drives_of(8, 1, 2.0)
     physics = Physics(p, np.array([loaded]), np.array([0.7]))
     link, moment = p.flange_inertia[0] + loaded * p.load_inertia[0], loaded * p.load_moment[0]
     x = np.array([0.7, 0.0, physics.z[0, 0], 0.0, physics.z[3, 0]])
@@ -128,7 +132,7 @@ def test_physics_agree_with_a_general_integrator(loaded):
 
 
 def test_energy_is_kept_without_friction_and_drive():
-    p = draw_parameters(3, 4, 1.0)
+    p = drives_of(3, 4)
     zero = np.zeros(4)
     p = replace(p, coulomb_torque=zero, breakaway_torque=zero, viscous_friction=zero, damping=zero, ripple=0 * p.ripple)
     physics = Physics(p, np.ones(4), np.full(4, 0.5))
@@ -151,7 +155,7 @@ def test_energy_is_kept_without_friction_and_drive():
 @pytest.mark.parametrize("loop", list(Loop))
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_at_constant_speed_current_is_friction_and_the_position_error_vanishes(loop, direction):
-    p = draw_parameters(9, 5, 1.0)
+    p = drives_of(9, 5)
     speed = direction * 0.8 * MAX_SPEED
     n = 6000
     velocity = np.clip(np.arange(n) / 500.0, 0, 1) * speed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,9 @@ def compared(
     certificate: ReliftCertificate, observer: Observer, batch: EpisodeBatch, estimates: Array | None = None
 ) -> list[Row]:
     """Compare responses, errors and bounds, episode by episode."""
-    seen, lengths, scales = course(observer, batch, estimates), batch.lengths, certificate.scales
+    seen, lengths, scales = course(observer, batch), batch.lengths, certificate.scales
+    if estimates is not None:
+        seen = replace(seen, error=observer.runtime.clip_estimate(batch.states) - estimates)
     with np.errstate(divide="ignore", invalid="ignore"):
         w = np.concatenate([seen.omega / scales.residual, seen.noise / scales.noise], axis=-1)
     w[np.isnan(w)] = 0.0

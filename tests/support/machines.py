@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from kros.core.lti import StateSpace
-from kros.export.c99.realise import in_coordinates
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Seen
 from kros.observer.filter_bank import FilterBank
 from kros.observer.monitor import Monitor, octaves
+from kros.observer.units import in_coordinates
 from kros.synthesis import Injection
 
 STATES, DT = ("position", "velocity", "current"), 1e-3

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
-import numpy as np
-import pytest
 from typer.testing import CliRunner
 
 from kros.cli import app
@@ -26,24 +23,6 @@ def test_population_has_three_states_and_an_input():
     assert population.unit("000").group == "outliers"
     assert population.read(KEY).shape == (1000, 4)
     assert len(population.episodes) == 8
-
-
-def test_a_unit_is_the_same_whatever_else_is_simulated():
-    first, second = SMALL.simulate(), DcMotorPopulation(n_units=2, n_episodes=5, seconds=2.0, seed=4).simulate()
-    np.testing.assert_allclose(first.population.read(KEY), second.population.read(KEY), atol=1e-9)
-    np.testing.assert_array_equal(first.population.read(KEY), SMALL.simulate().population.read(KEY))
-    assert np.abs(replace(SMALL, seed=5).simulate().population.read(KEY) - first.population.read(KEY)).max() > 0.1
-
-
-def test_parameters_spread_log_normally_around_the_nominal_ones():
-    truth = DcMotorPopulation(n_units=400, n_episodes=1, seconds=1.0, seed=1).simulate().truth
-    deviation = np.log(truth.viscous / 1e-4)
-    assert abs(deviation.mean()) < 4 * 0.15 / 20  # four standard errors
-    assert deviation.std() == pytest.approx(0.15, rel=0.15)
-    assert (
-        json.loads(json.dumps(replace(SMALL, spread=0.0).simulate().truth.as_dict()))["units"]["001"]["resistance"]
-        == 1.0
-    )
 
 
 def test_the_command_writes_motors_with_their_truth(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from kros.core.errors import ConfigError, DataError
 from kros.data import EpisodeKey
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.parameters import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, draw_parameters
+from kros.plants.harmonic_drive.parameters import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, DriveParameters
 
 SMALL = HarmonicDrivePopulation(n_units=3, n_episodes=2, seconds=3.0, seed=4, outlier=True)
 LOADED = EpisodeKey("001002", "load", "1")
@@ -62,7 +62,7 @@ def test_a_unit_is_the_same_whatever_else_is_simulated(small):
 
 @pytest.mark.parametrize("spread", [0.5, 1.0, 2.0])
 def test_spread_scales_the_stated_relative_deviations(spread):
-    p = draw_parameters(1, 3000, spread)
+    p = DriveParameters(**HarmonicDrivePopulation(n_units=3000, seed=1, spread=spread).units()[1])
     for name, (nominal, deviation) in NOMINAL.items():
         logs = np.log(getattr(p, name) / nominal)
         assert abs(logs.mean()) < 5 * spread * deviation / np.sqrt(3000)
@@ -74,7 +74,7 @@ def test_spread_scales_the_stated_relative_deviations(spread):
 
 
 def test_outlier_is_loose_by_its_severity():
-    mild, loose = (draw_parameters(2, 0, 1.0, severity) for severity in (0.0, 1.5))
+    mild, loose = (DriveParameters(**replace(SMALL, outlier_severity=s).units()[1]).take([0]) for s in (0.0, 1.5))
     for name, log_factor in OUTLIER_LOG_FACTORS.items():
         np.testing.assert_allclose(getattr(loose, name), np.exp(1.5 * log_factor) * getattr(mild, name))
     np.testing.assert_array_equal(loose.motor_inertia, mild.motor_inertia)

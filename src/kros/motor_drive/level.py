@@ -119,6 +119,4 @@ class RunningAngleLoad:
 
     def _coefficients(self) -> Array:
         """Solve the normal equations of c, two by two."""
-        (a, b), (_, d) = self._gram
-        first, second = self._right
-        return np.stack([d * first - b * second, a * second - b * first]) / (a * d - b * b)
+        return np.linalg.solve(self._gram.transpose(2, 0, 1), self._right.T[..., None])[..., 0].T

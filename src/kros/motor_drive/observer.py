@@ -81,7 +81,7 @@ def _at_limit(batch: EpisodeBatch, settings: LoadSettings) -> npt.NDArray[np.boo
     """Episodes in which the current reaches its limit, where the controller does not do what its errors say."""
     if settings.current is None:
         return np.zeros(len(batch.keys), bool)
-    return np.asarray(np.abs(batch.states[..., settings.current]).max(axis=0) >= settings.limit)
+    return np.abs(batch.states[..., settings.current]).max(axis=0) >= settings.limit
 
 
 def _visible(batch: EpisodeBatch, load: Array, left_out: int, settings: LoadSettings) -> EpisodeBatch:

@@ -32,7 +32,7 @@ def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) 
     if not 0 < corner_hz < top:
         raise ConfigError(f"Low-pass at {corner_hz:g} Hz: the corner should lie between 0 and {top:g} Hz.")
     sections = butter(4, corner_hz, fs=1 / sample_period_s, output="sos")
-    return np.asarray(sosfiltfilt(sections, np.asarray(signal, dtype=float), axis=0))
+    return sosfiltfilt(sections, np.asarray(signal, dtype=float), axis=0)
 
 
 def without_level(signal: npt.ArrayLike, level_s: float, sample_period_s: float) -> Array:
@@ -40,7 +40,7 @@ def without_level(signal: npt.ArrayLike, level_s: float, sample_period_s: float)
     from scipy.signal import lfilter
 
     signal, pole = np.asarray(signal, dtype=float), float(np.exp(-sample_period_s / level_s))
-    return np.asarray(lfilter([1.0, -1.0], [1.0, -pole], signal - signal[:1], axis=0))
+    return lfilter([1.0, -1.0], [1.0, -pole], signal - signal[:1], axis=0)
 
 
 def known_load(

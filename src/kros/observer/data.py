@@ -114,22 +114,31 @@ class ObserverData:
                 f"Observer {self.name}: the controller should map {q} innovations to {width} corrections "
                 f"({self.injection.value} injection), found {K.n_inputs} to {K.n_outputs}."
             )
-        self.runtime.require_fit(self.name, n)
+        for key, limit in self.runtime.limits().items():
+            self._require(f"runtime.{key}", limit.shape, (n,))
         if self.seen is not None:
             self._require("sizes seen in training", (len(self.seen.measured), len(self.seen.inputs)), (q, m))
         if self.monitor is not None:
             self._require("the monitor", self.monitor.size.shape, (q,))
-        require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
+        require_measured(self.sensor, self.outputs)
         if self.bank is not None:
-            self.bank.require_fit(self.name, len(self.recorded), n, rows + columns, q)
+            bank, recorded = self.bank, (len(self.recorded),)
+            shapes = bank.start.shape, bank.half.shape[-1:], bank.recovery.shape, bank.reach.shape
+            self._require("start, half, recovery and reach", shapes, ((n, rows + columns), recorded, recorded, (q,)))
+            if not 0 <= bank.filters <= (most := n - 2 * recorded[0]):
+                raise DimensionError(
+                    f"Observer {self.name}: its states leave at most {most} filters of measurements, found "
+                    f"{bank.filters}."
+                )
             if K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
                 )
         if self.guard is not None:
-            self.guard.require_fit(self.name, n, K.n_states)
+            sizes = [len(bound) for bound in (self.guard.lower, self.guard.upper, self.guard.correction)]
+            self._require("the guard of states and correction", tuple(sizes), (n, n, K.n_states))
 
-    def _require(self, what: str, shape: tuple[int, ...], wanted: tuple[int, ...]) -> None:
+    def _require(self, what: str, shape: tuple[Any, ...], wanted: tuple[Any, ...]) -> None:
         if shape != wanted:
             raise DimensionError(f"Observer {self.name}: {what} should have shape {wanted}, found {shape}.")
 
@@ -137,9 +146,14 @@ class ObserverData:
         """Say what kind of observer it is, in a line."""
         states, own = ", ".join(self.recorded), f" + {self.internal} internal" if self.internal else ""
         functions = f", {len(self.lifting.functions)} lifted functions" if self.lifting.functions else ""
-        y = ", ".join(self.lifting.states[i] for i in self.measured)
+        y = ", ".join(self.outputs)
         correction = f"correction of order {self.controller.n_states}, {self.sample_period_s:g} s"
         return f"<Observer {self.name}: {states}{own}{functions} from {y}; {correction}>"
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of the measured states."""
+        return [self.lifting.states[i] for i in self.measured]
 
     @property
     def internal(self) -> int:
@@ -199,22 +213,20 @@ class ObserverData:
     ) -> dict[str, Any]:
         """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`."""
         known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
-        unknown = [name for name in values if name not in known and name not in self.parameters]
-        missing = [name for name in known if values.get(name) is None]
-        wrong = [
-            name
-            for name in known
-            if name not in missing and not np.isfinite(np.asarray(values[name], dtype=float)).all()
-        ]
-        for names, what in ((unknown, "unknown"), (missing, "missing"), (wrong, "not finite")):
+        given = {name: np.asarray(values[name], dtype=float) for name in known if values.get(name) is not None}
+        problems = {
+            "unknown": [name for name in values if name not in known and name not in self.parameters],
+            "missing": [name for name in known if name not in given],
+            "not finite": [name for name, value in given.items() if not np.isfinite(value).all()],
+        }
+        for what, names in problems.items():
             if names:
                 raise ConfigError(
                     f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its lifting "
                     f"has {', '.join(known) or 'no parameters'}."
                 )
-        for name in known if shape is not None else ():
-            found = np.shape(values[name])
-            if found not in ((), shape, (1,) * len(shape or ())):
+        for name, value in given.items() if shape is not None else ():
+            if (found := value.shape) not in ((), shape, (1,) * len(shape or ())):
                 raise DimensionError(
                     f"Running observer {self.name}: the parameter {name!r} should have shape {shape}, found {found}."
                 )

@@ -59,15 +59,9 @@ class _Controller(_Model):
     D: Matrix
 
 
-class _Runtime(_Part):
-    delay: int = 0
-    lower: Limits | None = None
-    upper: Limits | None = None
-
-
 def _part(kind: Any) -> Any:
     """Return what the file holds of a part whose fields are numbers, arrays of them, or numbers by name."""
-    types: dict[str, Any] = {"Array": Row | Matrix, "float": float, "int": int, "Mapping[str, float]": dict[str, float]}
+    types: dict[str, Any] = {"Array": Row | Matrix, "Array | None": Limits, "float": float, "int": int}
     held: dict[str, Any] = {}
     for f in fields(kind):
         needed = f.default is MISSING and f.default_factory is MISSING
@@ -76,6 +70,11 @@ def _part(kind: Any) -> Any:
 
 
 _PARTS: dict[str, Any] = {"seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
+
+
+def _field(key: str) -> str:
+    """Return the observer's field of a part."""
+    return key.removeprefix("filter_")
 
 
 class _File(_Part):
@@ -92,19 +91,18 @@ class _File(_Part):
     sample_period_s: float = Field(gt=0)
     model: _Model
     controller: _Controller
-    runtime: _Runtime | None = None
     sensor: dict[str, Any] = Field(default_factory=dict)
     about: dict[str, Any] = Field(default_factory=dict)
 
 
-_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
+_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in {**_PARTS, "runtime": Runtime}.items()}
 _Whole = create_model("_Whole", __base__=_File, **_KINDS)
 
 
 def observer_content(observer: ObserverData) -> dict[str, Any]:
     """Return what the file of an observer holds, without its checksum."""
     lifting = observer.lifting
-    parts = {"seen": observer.seen, "filter_bank": observer.bank, "guard": observer.guard, "monitor": observer.monitor}
+    parts = {key: getattr(observer, _field(key)) for key in _PARTS}
     content = {
         "schema": SCHEMA,
         "kind": KIND,
@@ -119,13 +117,13 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "sample_period_s": observer.sample_period_s,
         "model": {"A": observer.A, "B": observer.B},
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
-        "runtime": {key: value for key, value in vars(observer.runtime).items() if np.any(value)},
+        "runtime": {"delay": observer.runtime.delay, **observer.runtime.limits()},
         **{key: vars(part) for key, part in parts.items() if part is not None},
         "sensor": {name: sensor.model_dump() for name, sensor in observer.sensor.items()},
         "about": observer.about,
     }
     written: dict[str, Any] = plain(content)
-    return {key: value for key, value in written.items() if value or key not in ("runtime", "sensor", "about")}
+    return {key: value for key, value in written.items() if value or key not in ("sensor", "about")}
 
 
 def write_observer(observer: ObserverData, path: Path) -> None:
@@ -174,7 +172,7 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
     shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
     A, B, C, D = (_matrix(content["controller"][key], shape, f"controller.{key}") for key, shape in shapes.items())
     given = {key: content[key] for key in _PARTS if content[key] is not None}
-    parts = {key: _PARTS[key](**{k: v for k, v in part.items() if v is not None}) for key, part in given.items()}
+    parts = {_field(k): _PARTS[k](**{f: v for f, v in part.items() if v is not None}) for k, part in given.items()}
     return ObserverData(
         content["name"],
         lifting,
@@ -189,7 +187,6 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         Runtime.from_content(content["runtime"] or {}),
         sensor={name: Sensor.of(value, f"sensor.{name}") for name, value in content["sensor"].items()},
         about=content["about"],
-        bank=parts.pop("filter_bank", None),
         **parts,
     )
 

@@ -29,7 +29,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
+from ..core.errors import DataError
+from ..core.linalg import floats
 from ..core.rounding import ITERATED
 
 Array = npt.NDArray[np.float64]
@@ -49,8 +50,7 @@ class FilterBank:
     reach: Array
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        floats(self, *_ARRAYS)
         starts = np.isfinite(self.start).all() and np.isfinite(self.reach).all() and (self.reach >= 0).all()
         if not (starts and np.isfinite(self.half).all() and (self.half > 0).all()):
             raise DataError(
@@ -61,34 +61,19 @@ class FilterBank:
                 f"Filter bank: forget {self.forget} and recovery {self.recovery} should be between 0 and 1."
             )
 
-    def require_fit(self, name: str, recorded: int, n: int, columns: int, measured: int) -> None:
-        """Refuse arrays of another size than the observer's."""
-        sizes = tuple(getattr(self, name).shape for name in _ARRAYS if name != "half")
-        sizes = (*sizes[:2], self.half.shape[-1:], *sizes[2:])
-        if sizes != ((n, columns), *[(recorded,)] * 3, (measured,)) or not 0 <= self.filters <= n - 2 * recorded:
-            raise DimensionError(
-                f"Observer {name}: its filter bank should have a start {(n, columns)}, {recorded} values of forget, "
-                f"half and recovery and {measured} of reach, found {sizes}, and at most {n - 2 * recorded} filters, "
-                f"found {self.filters}."
-            )
-
     def level(self, age: Array) -> Array:
         """Return m of every recorded state at ages, shape (..., n)."""
         ratio = age / self.half
-        return np.asarray(ratio * ratio / (1 + ratio * ratio))
+        return ratio * ratio / (1 + ratio * ratio)
 
-    def times(self, x: Array, columns: Array, y: Array) -> FilterBank:
-        """Return the bank in other units of measure, by factors of states, columns of `start` and measurements."""
-        return replace(self, start=self.start * x[:, None] / columns, reach=self.reach * y)
-
-    def turned(self, turn: Array) -> FilterBank:
-        """Return the bank for states ``turn @ x``, shape (n, n), which leaves recorded states and fallback alone."""
-        return replace(self, start=turn @ self.start)
+    def times(self, columns: Array, y: Array) -> FilterBank:
+        """Return the bank in other units of measure, by factors of the columns of `start` and of measurements."""
+        return replace(self, start=self.start / columns, reach=self.reach * y)
 
 
 def longest_age(half: Array) -> Array:
     """Return the largest ages that count when measurements return: m is then below 1 % after five time constants."""
-    return np.asarray(0.1 * np.exp(5) * half)
+    return 0.1 * np.exp(5) * half
 
 
 class Gaps:
@@ -130,7 +115,7 @@ class Gaps:
         last = x[:, : self.recorded].copy()
         last[:, self.measured] = y
         fallback, share = x[:, self.fallback], self.hidden * self.bank.level(self.age)
-        return np.asarray(self.bank.forget * (last - fallback + share * (self.offset - last + fallback)))
+        return self.bank.forget * (last - fallback + share * (self.offset - last + fallback))
 
     def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
         """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""

@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from ..core.linalg import floats
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -51,8 +52,7 @@ class Monitor:
 
     def __post_init__(self) -> None:
         arrays = ("filters", "size", "limits", "weights")
-        for name in arrays:
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        floats(self, *arrays)
         shapes, (bands, q) = [getattr(self, name).shape for name in arrays], (len(self.filters), self.size.size)
         if not bands or shapes != [(bands, 3), (q,), (q, bands), (q, bands)]:
             raise DataError(
@@ -113,7 +113,7 @@ class Monitor:
     def level(self, mean_squares: Array) -> Array:
         """Return the level over the bound in dB, (...), of mean squares (..., q, bands)."""
         levels = 10 * np.log10(np.maximum(mean_squares / self.limits, QUIET))
-        return np.asarray((levels * self.weights).sum(axis=(-2, -1)) / WEIGHT)
+        return (levels * self.weights).sum(axis=(-2, -1)) / WEIGHT
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
@@ -125,13 +125,17 @@ def octaves(count: int = 6, quality: float = 1.4) -> Array:
 
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
     """Return which samples are judged, as a running observer does it; status and flags (n_samples, batch)."""
-    judged, bad, wait = np.zeros(status.shape, dtype=bool), status != 0, np.zeros(status.shape[1], dtype=int)
+    judged, wait = np.zeros(status.shape, dtype=bool), np.zeros(status.shape[1], dtype=int)
     for k in range(len(status)):
-        wait = np.where(starts[k], settle, wait)  # samples that are not judged yet
-        judged[k] = moving[k] & ~bad[k] & (wait == 0)
-        following = np.where(bad[k], np.minimum(wait + RECOVERY, settle), np.maximum(wait - 1, 0))
-        wait = np.where(moving[k], following, wait)
+        judged[k], wait = judge(wait, settle, status[k] != 0, starts[k], moving[k])
     return judged
+
+
+def judge(wait: Any, settle: int, bad: Any, start: Any, moving: Any) -> tuple[Any, Any]:
+    """Return which machines are judged at a sample, and how many more samples each is not."""
+    wait = np.where(start, settle, wait)
+    following = np.where(bad, np.minimum(wait + RECOVERY, settle), np.maximum(wait - 1, 0))
+    return moving & ~bad & (wait == 0), np.where(moving, following, wait)
 
 
 class Watch:
@@ -145,19 +149,12 @@ class Watch:
         """Forget everything."""
         self._filters, self._squares = np.zeros((2, *self._monitor.limits.shape)), np.zeros(self._monitor.limits.shape)
         self._gain, self.outside = max(self._monitor.first, self._monitor.forget), False
-        self.begin()
+        self._wait: Any = self._monitor.settle
 
-    def begin(self) -> None:
-        """Judge nothing until the observer has settled."""
-        self._wait = self._monitor.settle
-
-    def take(self, innovation: Array, good: bool) -> None:
-        """Take the innovation of every channel, (q,); whether the sample is good by itself."""
-        if not good:
-            self._wait = min(self._wait + RECOVERY, self._monitor.settle)
-            return
-        if self._wait > 0:
-            self._wait -= 1
+    def take(self, innovation: Array, bad: Any, start: Any, moving: Any) -> None:
+        """Take the innovation of every channel, (q,); the flags are those of `judge`."""
+        judged, self._wait = judge(self._wait, self._monitor.settle, bad, start, moving)
+        if not judged:
             return
         b, a1, a2 = self._monitor.filters.T
         driven = b * self._monitor.scaled(innovation)[:, None]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DimensionError
 from .data import ObserverData
 from .monitor import Watch
-from .screen import LONGEST, SampleStatus, Screen
+from .screen import LONGEST, Held, SampleStatus, Screen, Screened
 from .simulate import Course, stepped
 from .step import forward
 from .tracking import PhaseLockedLoop
@@ -83,7 +83,6 @@ class RunningObserver:
         self.observer = observer
         self._screen, self._course = Screen.of(observer), Course(observer, 1, parameters)
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
-        self._measured = tuple(observer.lifting.states[i] for i in observer.measured)
         self._watch = None if observer.monitor is None else Watch(observer.monitor)
         self.parameters = parameters
         self.reset(y)
@@ -126,7 +125,7 @@ class RunningObserver:
 
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
-        first = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(self.observer.inputs))))
+        first = self._sample(y)
         self._status, self._fresh = SampleStatus(int(first.status[0, 0])), bool(np.isfinite(first.y).any())
         self._course.begin(first)
         if self._watch is not None:
@@ -146,7 +145,7 @@ class RunningObserver:
         o, steps = self.observer, self._course.steps
         if len(self._course.ahead()) < o.runtime.delay:
             return self.estimate
-        given = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(o.inputs)))).y[0]
+        given = self._sample(y).y[0]
         nu = np.where(np.isfinite(given), steps.innovation(given), 0.0)
         return self._forward(steps.x + nu @ self._filter_gain.T)
 
@@ -172,7 +171,7 @@ class RunningObserver:
             When there are not as many measurements or inputs as the observer has.
         """
         course, watch, bank = self._course, self._watch, self.observer.bank
-        sample = self._screen.take(self._measurement(y)[None, None], self._input(u)[None, None], course.held)
+        sample = self._sample(y, u, course.held)
         if self._fresh and not (sample.held.since > LONGEST).any():  # it was started at this sample
             starts = sample.starts & (bank is not None)
             sample = replace(sample, starts=starts, held=replace(sample.held, stale=np.zeros(1, dtype=bool)))
@@ -180,23 +179,20 @@ class RunningObserver:
         run = stepped(course, sample)
         if course.loop is not None:
             self.parameters[course.loop.name] = float(course.values[course.loop.name][0])
-        if watch is not None and run.starts[0, 0]:
-            watch.begin()
-        moved = bool(run.moving[0, 0])
-        if watch is not None and moved:
-            watch.take(run.innovation[0, 0], not sample.status[0, 0])
+        if watch is not None:
+            watch.take(run.innovation[0, 0], sample.status[0, 0] != 0, run.starts[0, 0], run.moving[0, 0])
         self._status = SampleStatus(int(sample.status[0, 0] | run.status[0, 0]))
-        if moved and not course.steps.waiting[0] and self.observer.runtime.binds(course.steps.x[0]):
+        if run.moving[0, 0] and not course.steps.waiting[0] and self.observer.runtime.binds(course.steps.x[0]):
             self._status |= SampleStatus.LIMIT
         if watch is not None and watch.outside:
             self._status |= SampleStatus.UNCERTIFIED
         return self.estimate
 
-    def _measurement(self, y: npt.ArrayLike) -> Array:
-        return self._shaped(y, "measurements", self._measured)
-
-    def _input(self, u: npt.ArrayLike) -> Array:
-        return self._shaped(u, "inputs", self.observer.inputs)
+    def _sample(self, y: npt.ArrayLike, u: npt.ArrayLike | None = None, held: Held | None = None) -> Screened:
+        """Return a sample as the observer takes it; inputs are zero where none are known yet."""
+        inputs = self.observer.inputs
+        y, u = self._shaped(y, "measurements", self.observer.outputs), np.zeros(len(inputs)) if u is None else u
+        return self._screen.take(y[None, None], self._shaped(u, "inputs", inputs)[None, None], held)
 
     def _shaped(self, values: npt.ArrayLike, what: str, names: Sequence[str]) -> Array:
         array = np.array(values, dtype=float, ndmin=1)  # a copy: the caller may use its memory again

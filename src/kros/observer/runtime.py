@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
+from ..core.errors import DataError
+from ..core.linalg import floats
 
 Array = npt.NDArray[np.float64]
 
@@ -42,9 +43,8 @@ class Seen:
     inputs: Array
 
     def __post_init__(self) -> None:
-        for name in ("measured", "inputs"):
-            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            object.__setattr__(self, name, values)
+        floats(self, "measured", "inputs")
+        for name, values in vars(self).items():
             if values.ndim != 1 or not np.isfinite(values).all() or np.any(values < 0):
                 raise DataError(
                     f"Sizes seen in training: {name} should be one finite size of at least 0 a channel, found {values}."
@@ -90,8 +90,8 @@ class Runtime:
         what = "Runtime of an observer"
         if int(self.delay) != self.delay or self.delay < 0:
             raise DataError(f"{what}: the delay of {self.delay} should be a whole number of samples, at least 0.")
-        for name, value in self.limits().items():
-            object.__setattr__(self, name, np.asarray(value, dtype=float))
+        floats(self, *self.limits())
+        for name in self.limits():
             if np.isnan(getattr(self, name)).any():
                 raise DataError(f"{what}: {name} is not a number; leave limits out, or make them infinite.")
         if len(self.limits()) > 1 and np.any(np.greater(*self.limits().values())):
@@ -115,28 +115,21 @@ class Runtime:
         low, high = self.sides(len(x))
         return bool(np.any((x <= low) | (x >= high)))
 
-    def clip_estimate(self, x: Array) -> Array:
+    def clip_estimate(self, x: Array, out: Array | None = None) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
-        return np.clip(x, *self.sides(x.shape[-1])) if self.limits() else x
+        return np.clip(x, *self.sides(x.shape[-1]), out=out) if self.limits() else x
 
     def times(self, x: Array) -> Runtime:
         """Return the same in other units of measure, by the factors of the states."""
         changes: dict[str, Any] = {name: limit * x for name, limit in self.limits().items()}
         return replace(self, **changes)
 
-    def require_fit(self, name: str, n: int) -> None:
-        """Refuse limits of another size than the observer's."""
-        for key, limit in self.limits().items():
-            if limit.shape != (n,):
-                raise DimensionError(f"Observer {name}: runtime.{key} should have shape ({n},), found {limit.shape}.")
-
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Runtime:
         """Read the fields that a file holds; null stands for what is infinite."""
-        ends = {name: content.get(name) for name in ("lower", "upper")}
-        none = {"lower": -np.inf, "upper": np.inf}
-        limits = {k: np.array([none[k] if v is None else v for v in row]) for k, row in ends.items() if row}
-        return cls(content.get("delay", 0), **limits)
+        ends = {name: end for name, end in (("lower", -np.inf), ("upper", np.inf)) if content.get(name)}
+        limits = {name: np.nan_to_num(np.array(content[name], dtype=float), nan=end) for name, end in ends.items()}
+        return cls(content.get("delay") or 0, **limits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,31 +142,17 @@ class Guard:
     settle: int  # samples after a start until the estimate is as good as before
 
     def __post_init__(self) -> None:
-        for name in ("lower", "upper", "correction"):
-            object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=float)))
+        floats(self, "lower", "upper", "correction")
         if not (np.all(self.lower < self.upper) and np.all(self.correction > 0) and self.settle >= 0):
             raise DataError(
                 f"Guard of an observer: lower bounds {self.lower} should be below the upper ones {self.upper}, sizes "
                 f"{self.correction} of the correction above zero, and {self.settle} samples to settle at least 0."
             )
 
-    def times(self, x: Array) -> Guard:
-        """Return the guard of states multiplied by factors, shape (n,); states of the correction stay."""
-        return replace(self, lower=self.lower * x, upper=self.upper * x)
-
     def turned(self, turn: Array) -> Guard:
-        """Return the smallest box around the states ``turn @ x``, shape (n, n)."""
+        """Return the smallest box around the states ``turn @ x``, shape (n, n); states of the correction stay."""
         middle, half = turn @ (self.lower + self.upper) / 2, np.abs(turn) @ (self.upper - self.lower) / 2
         return replace(self, lower=middle - half, upper=middle + half)
-
-    def require_fit(self, name: str, n: int, order: int) -> None:
-        """Refuse bounds of another size than the observer's."""
-        shapes = (self.lower.shape, self.upper.shape, self.correction.shape)
-        if shapes != ((n,), (n,), (order,)):
-            raise DimensionError(
-                f"Observer {name}: a guard of {n} states and {order} of the correction is needed, found shapes "
-                f"{shapes}."
-            )
 
 
 def bounds(guard: Guard | None, n: int, order: int) -> tuple[Array, Array]:

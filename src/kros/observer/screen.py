@@ -21,7 +21,7 @@ and a start costs no more than a start. Parameters stay.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import Any
@@ -104,18 +104,20 @@ class Screened:
 
     def of(self, members: Sequence[int] | Whole) -> Screened:
         """Return the samples of some members of the batch."""
-        signals: dict[str, Any] = {name: getattr(self, name)[:, members] for name in _SIGNALS}
-        return replace(self, held=Held(*(value[members] for value in vars(self.held).values())), **signals)
+        held = Held(*(value[members] for value in vars(self.held).values()))
+        return replace(self.each(lambda name: getattr(self, name)[:, members]), held=held)
 
     def rows(self, part: slice) -> Screened:
         """Return some samples of all members."""
-        signals: dict[str, Any] = {name: getattr(self, name)[part] for name in _SIGNALS}
-        return replace(self, **signals)
+        return self.each(lambda name: getattr(self, name)[part])
 
     def after(self, before: Screened) -> Screened:
         """Return the samples behind earlier ones."""
-        signals: dict[str, Any] = {n: np.concatenate([getattr(before, n), getattr(self, n)]) for n in _SIGNALS}
-        return replace(self, **signals)
+        return self.each(lambda name: np.concatenate([getattr(before, name), getattr(self, name)]))
+
+    def each(self, signal: Callable[[str], Any]) -> Screened:
+        """Return the same with other signals, by name."""
+        return replace(self, **{name: signal(name) for name in _SIGNALS})
 
 
 def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:

@@ -91,5 +91,6 @@ def in_units(sensor: Sensors, sizes: Mapping[str, float]) -> dict[str, Sensor]:
 def sides(limits: Mapping[str, FoundLimit], states: Sequence[str]) -> tuple[Array, Array]:
     """Return lower and upper limits that states reached in recordings, infinite where there is none."""
     ends = [(limits[name].lower, limits[name].upper) if name in limits else (None, None) for name in states]
-    lower = [-np.inf if low is None else low for low, _ in ends]
-    return np.array(lower), np.array([np.inf if high is None else high for _, high in ends])
+    known = np.array(ends, dtype=float)
+    lower, upper = np.where(np.isnan(known), [-np.inf, np.inf], known).T
+    return lower, upper

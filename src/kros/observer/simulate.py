@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..loops import Library, formulas, library, tape_of
 from .data import ObserverData
 from .monitor import judged_samples
-from .runtime import Guard, bounds
+from .runtime import bounds
 from .screen import Bits, Flags, Held, SampleStatus, Screened, Whole, screened
 from .step import Parameters, Steps, forward
 
@@ -74,13 +74,7 @@ def run_observers(
     first = observers[0]
     if len(observers) > 1 and (first.bank is not None or (first.runtime.delay and first.lifting.history)):
         return np.stack([run_observer(o, y, u, parameters) for o in observers])
-    (n_samples, batch), n = np.shape(y)[:2], first.lifting.n_states
-    states = np.empty((n_samples, len(observers), n, batch))
-    runs = _run(observers, screened(first, y, u), parameters, states=states)
-    for i, run in enumerate(runs):
-        if not np.may_share_memory(run.estimates, states):
-            states[:, i] = run.estimates.swapaxes(1, 2)
-    return states.transpose(1, 0, 3, 2)
+    return np.stack([run.estimates for run in _run(observers, screened(first, y, u), parameters)])
 
 
 def run_innovations(
@@ -88,18 +82,15 @@ def run_innovations(
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
     samples = screened(observer, y, u)
-    run = _run([observer], samples, parameters, innovations=True)[0]
-    starts = run.starts.copy()
-    starts[0] = True
-    return run.innovation, judged_samples(settle, samples.status | run.status, starts, run.moving)
+    run = _run([observer], samples, parameters)[0]
+    run.starts[0] = True
+    return run.innovation, judged_samples(settle, samples.status | run.status, run.starts, run.moving)
 
 
 def _run(
     observers: Sequence[ObserverData],
     samples: Screened,
     parameters: Parameters | None,
-    innovations: bool = False,
-    states: Array | None = None,
 ) -> list[Stepped]:
     """Run observers of one model: compiled, and in NumPy again the machines that leave bounds or have gaps to fill."""
     loops, batch = library(), samples.starts.shape[1]
@@ -107,22 +98,15 @@ def _run(
     if loops is None:
         runs = [stepped(course, samples) for course in courses]
     else:
-        runs, again = _compiled(loops, courses, samples, innovations, states)
+        runs, again = _compiled(loops, courses, samples)
         if observers[0].bank is not None:
             again = again | ~np.isfinite(samples.y).all(axis=(0, 2))
         for run, course, some in zip(runs, courses, again, strict=True):
             if some.any():
                 run.replace(np.flatnonzero(some), course, samples)
     for run, observer in zip(runs, observers, strict=True):
-        _limit(observer, run.estimates)
+        observer.runtime.clip_estimate(run.estimates, out=run.estimates)
     return runs
-
-
-def _limit(observer: ObserverData, estimates: Array) -> None:
-    """Bring estimates, (..., n), within their limits, in place."""
-    n, sides = observer.lifting.n_states, observer.runtime.sides(observer.lifting.n_states)
-    for i in observer.runtime.limited_states(n):
-        np.clip(estimates[..., i], sides[0][i], sides[1][i], out=estimates[..., i])
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,24 +122,10 @@ class Stepped:
 
     def replace(self, machines: Whole, course: Course, samples: Screened) -> None:
         """Put what some machines do in NumPy in the place of what they did, from the first sample of all."""
-        values, batch = course.values, samples.starts.shape[1]
-        own = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[machines] for name, v in values.items()}
+        own = {name: v[machines] for name, v in course.values.items()}
         part = stepped(Course(course.observer, len(machines), own), samples.of(machines))
-        for name in ("estimates", "status", "starts", "moving", *(("innovation",) if len(self.innovation) else ())):
+        for name in ("estimates", "innovation", "status", "starts", "moving"):
             getattr(self, name)[:, machines] = getattr(part, name)
-
-
-class Restarts:
-    """Counts down, over a batch of machines, until their starts have settled."""
-
-    def __init__(self, guard: Guard | None, batch: int) -> None:
-        self._settle, self.left = 0 if guard is None else guard.settle, np.zeros(batch, dtype=int)
-
-    def after(self, waiting: Flags) -> Flags:
-        """Return which machines wait for a start after a step, or have not settled since."""
-        restarted = waiting | (self.left > 0)
-        self.left = np.where(waiting, self._settle, np.maximum(self.left - 1, 0))
-        return restarted
 
 
 class Course:
@@ -168,11 +138,9 @@ class Course:
         parameters: Parameters | None = None,
         loop: Any = None,
     ) -> None:
-        values: dict[str, Any] = observer.values(parameters, (batch,))
-        if loop is not None:
-            values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in values.items()}
-        self.observer, self.loop, self.values = observer, loop, values
-        self.steps, self.restarts = Steps(observer, batch, values), Restarts(observer.guard, batch)
+        self.values: dict[str, Any] = {k: v + np.zeros(batch) for k, v in observer.values(parameters, (batch,)).items()}
+        self.observer, self.loop, self.steps = observer, loop, Steps(observer, batch, self.values)
+        self.settling = np.zeros(batch, dtype=int)  # samples until a start has settled
         self.since = np.full(batch, -1, dtype=np.intp)  # samples since a start, at most the delay
         self._before: Screened | None = None  # as many samples as measurements are late
 
@@ -189,7 +157,7 @@ class Course:
     def begin(self, first: Screened) -> None:
         """Start all machines at a sample, (1, batch, q), that `take` sees again."""
         self.steps.begin(first.y[0])
-        self.restarts, self.since = Restarts(self.observer.guard, len(self.since)), np.full_like(self.since, -1)
+        self.settling[:], self.since[:] = 0, -1
         self._before = replace(first.rows(slice(0)), held=Held.nothing(*first.u.shape[1:]))
         if self.loop is not None:
             self.loop.begin()
@@ -199,10 +167,10 @@ class Course:
         samples = screened(self.observer, y, u, self.held)
         loops, run = library(), None
         if loops is not None and self.even(samples):
-            runs, restarted = _compiled(loops, [self], samples)
-            run = None if restarted.any() else runs[0]
-        run = stepped(self, samples) if run is None else run
-        _limit(self.observer, run.estimates)
+            (run,), restarted = _compiled(loops, [self], samples)
+        if run is None or restarted.any():
+            run = stepped(self, samples)
+        self.observer.runtime.clip_estimate(run.estimates, out=run.estimates)
         return replace(run, status=run.status | samples.status)
 
     def even(self, samples: Screened) -> bool:
@@ -210,7 +178,7 @@ class Course:
         gaps = self.steps.gaps
         lost = gaps is not None and not np.isfinite(samples.y).all()
         filled = gaps is not None and bool(gaps.age.any() or samples.starts[-1].any())
-        return self.loop is None and not (lost or filled or self.steps.waiting.any() or self.restarts.left.any())
+        return self.loop is None and not (lost or filled or self.steps.waiting.any() or self.settling.any())
 
     def enter(self, samples: Screened) -> tuple[Screened, int]:
         """Start at the first sample of all; return samples behind those that inputs are still needed of, a number."""
@@ -234,6 +202,7 @@ def stepped(course: Course, samples: Screened) -> Stepped:
     samples, lead = course.enter(samples)
     (n_samples, batch), observer, loop = samples.starts.shape, course.observer, course.loop
     steps, values, d = course.steps, course.values, observer.runtime.delay
+    settle = 0 if observer.guard is None else observer.guard.settle
     x, nu = np.empty((n_samples, batch, observer.lifting.n_states)), np.zeros(samples.y.shape)
     earlier = np.zeros((n_samples, batch, len(observer.lifting.window.earlier)))
     starts, moving, status = samples.starts.copy(), np.zeros(nu.shape[:2], dtype=bool), np.zeros(nu.shape[:2], np.uint8)
@@ -258,7 +227,8 @@ def stepped(course: Course, samples: Screened) -> Stepped:
         else:
             followed[k] = values[loop.name]
             values[loop.name] = loop.step(steps, y, u)
-        status[k][course.restarts.after(steps.waiting)] = SampleStatus.RESTARTED
+        status[k][steps.waiting | (course.settling > 0)] = SampleStatus.RESTARTED
+        course.settling = np.where(steps.waiting, settle, np.maximum(course.settling - 1, 0))
     course.leave(samples)
     if d:
         _predict(observer, x, earlier, pending, samples, values)
@@ -273,14 +243,14 @@ def _pending(starts: Flags, delay: int, since: npt.ArrayLike = -1) -> Whole:
 
 
 def _predict(
-    observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Parameters
+    observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Mapping[str, Array]
 ) -> None:
     """Predict states (n_samples, batch, n) to their rows, without correction."""
     batch = x.shape[1]
     for start in range(0, len(x), _ROWS):
         rows = np.arange(start, min(start + _ROWS, len(x)))
         count, size = pending[rows], len(rows) * batch
-        each = {p: np.tile(np.broadcast_to(np.asarray(v, dtype=float), (batch,)), len(rows)) for p, v in values.items()}
+        each = {p: np.tile(v, len(rows)) for p, v in values.items()}
         at = rows[:, None] - count + np.arange(observer.runtime.delay)[:, None, None]
         u = samples.u[np.minimum(at, len(samples.u) - 1), np.arange(batch)]
         signals = (part.reshape(*part.shape[:-3], size, part.shape[-1]) for part in (x[rows], earlier[rows], u))
@@ -291,20 +261,17 @@ def _compiled(
     loops: Library,
     courses: Sequence[Course],
     samples: Screened,
-    innovations: bool = False,
-    states: Array | None = None,
 ) -> tuple[list[Stepped], Flags]:
     """Run observers of one model on in the compiled loop; return which machines left bounds, (observer, batch)."""
     (samples, lead), *_ = [course.enter(samples) for course in courses]
     observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay
     (n_samples, batch), n, m = samples.starts.shape, observers[0].lifting.n_states, samples.u.shape[2]
     late = np.zeros((lead, batch), dtype=np.intp), _pending(samples.starts[lead:], delay, courses[0].since)
-    pending, states = np.concatenate(late), _empty(n_samples, len(observers), n, batch) if states is None else states
-    job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states}
-    innovation = _empty(*samples.y.shape) if innovations else _empty(0, *samples.y.shape[1:])
-    before = _empty(n_samples, batch, job["past"].shape[-1])
+    pending, states = np.concatenate(late), np.empty((n_samples, len(observers), n, batch))
+    innovation = np.empty(samples.y.shape)  # of the first observer
+    job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states, "innovation": innovation}
+    before = np.empty((n_samples, batch, job["past"].shape[-1]))
     moving = (pending == delay) & (~samples.starts | (delay == 0))
-    job |= {"innovation": innovation} if innovations else {}
     if delay:
         job |= {"moving": moving, "before": before, "pending": pending}
     tape = formulas(observers[0].lifting, tape_of(observers[0].lifting, m), values, m, batch)
@@ -321,10 +288,6 @@ def _compiled(
         status, starts = np.zeros((n_samples - lead, batch), np.uint8), samples.starts[lead:].copy()
         runs.append(Stepped(x[lead:], innovation[lead:], status, starts, moving[lead:].copy(), np.empty(0)))
     return runs, restarted
-
-
-def _empty(*shape: int) -> Array:
-    return np.empty(shape)
 
 
 def _job(courses: Sequence[Course], samples: Screened) -> dict[str, Any]:
@@ -366,20 +329,20 @@ def _put(course: Course, left: Mapping[str, Array], fresh: Bits, last: Array, sa
     course.leave(samples)
 
 
-def _begins(observers: Sequence[ObserverData], samples: Screened, values: Parameters) -> dict[str, Any]:
+def _begins(observers: Sequence[ObserverData], samples: Screened, values: Mapping[str, Array]) -> dict[str, Any]:
     """Return the estimates of machines that start after the first sample of all, and which they are."""
     rows, machines = np.nonzero(samples.starts)
     if not len(rows):
         return {}
     number = np.zeros(samples.starts.shape, dtype=np.int32)
     number[rows, machines] = 1 + np.arange(len(rows))
-    each = {p: np.broadcast_to(np.asarray(v, dtype=float), number.shape[1:])[machines] for p, v in values.items()}
+    each = {p: v[machines] for p, v in values.items()}
     first = [o.initial(samples.y[rows, machines], each, samples.u[rows, machines]) for o in observers]
     return {"begin": number, "begun": np.stack(first), "begins": len(rows)}
 
 
 def _padded(observer: ObserverData, order: int) -> Array:
     """Return the one-step map with silent controller states up to an order."""
-    n, nl, own = observer.lifting.n_states, observer.lifting.n_lifted, observer.controller.n_states
+    nl, own = observer.lifting.n_lifted, observer.controller.n_states
     step = np.insert(observer.one_step, [nl + own] * (order - own), 0.0, axis=1)
-    return np.ascontiguousarray(np.insert(step, [n + own] * (order - own), 0.0, axis=0))
+    return np.pad(step, ((0, order - own), (0, 0)))

@@ -41,11 +41,6 @@ class Steps:
         if self.gaps is not None:
             self.gaps.begin(rows)
 
-    def place(self, x: Array, earlier: Array) -> None:
-        """Put states, shape (batch, n), and earlier values in place; corrections start at rest."""
-        self.x[...], self.x_c[...], self.past[...] = x, 0.0, earlier
-        self.fresh[:], self.waiting[:] = False, False
-
     def earlier(self, u: Array) -> Array:
         """Return the earlier values, (batch, n_earlier); after a start they equal the present ones."""
         if not self.fresh.any():
@@ -55,7 +50,7 @@ class Steps:
 
     def innovation(self, y: Array) -> Array:
         """Return ``y - C x_hat``, shape (batch, q); not finite where y is not."""
-        return np.asarray(y - self.x[:, self._measured])
+        return y - self.x[:, self._measured]
 
     def step(self, y: Array, u: Array, moving: Flags | None = None) -> None:
         """Take measurements, shape (batch, q), not finite where one is missing, and inputs, shape (batch, m)."""
@@ -70,19 +65,15 @@ class Steps:
         following = np.concatenate([theta, self.x_c, inputs, y], axis=-1) @ self._map.T
         if self.gaps is not None:
             self.gaps.follow(self.x, following[:, :n], missing)
-        on = self._guarded(following, moving)[:, None]
+        within = ((following >= self._low) & (following <= self._high)).all(axis=-1)
+        going = ~self.waiting if moving is None else moving & ~self.waiting
+        self.waiting |= going & ~within  # a step that would leave the bounds is not taken
+        on = (going & within)[:, None]
         np.copyto(self.x, following[:, :n], where=on)
         np.copyto(self.x_c, following[:, n:], where=on)
         if delays:
             np.copyto(self.past, self.lifting.window.advance(window, u), where=on)
             self.fresh &= ~on[:, 0]
-
-    def _guarded(self, following: Array, moving: Flags | None) -> Flags:
-        """Return which machines take the step, shape (batch,): none that wait, and none that would leave the bounds."""
-        within = ((following >= self._low) & (following <= self._high)).all(axis=-1)
-        going = ~self.waiting if moving is None else moving & ~self.waiting
-        self.waiting |= going & ~within
-        return going & within
 
 
 def forward(
@@ -90,7 +81,7 @@ def forward(
 ) -> Array:
     """Predict states (batch, n) over the first ``count`` inputs of u (d, batch, m), without correction."""
     steps, missing = Steps(observer, len(x), values), np.full((len(x), len(observer.measured)), np.nan)
-    steps.place(x, earlier)
+    steps.x[...], steps.past[...], steps.fresh[:] = x, earlier, False
     for j, inputs in enumerate(u):
         steps.step(missing, inputs, j < count)
     return steps.x

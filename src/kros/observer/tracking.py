@@ -70,14 +70,11 @@ class PhaseLockedLoop:
         K, n, values = self.observer.controller, self._model.shape[0], steps.values
         x, psi = steps.x.copy(), self._s[:, self._C].copy()
         nu = np.where(np.isfinite(y), steps.innovation(y), 0.0)
-        slopes, by_value = (
-            steps.lifting.slopes(x, values)[..., :n],
-            steps.lifting.slopes(x, values, (self.name,))[..., 0],
-        )
+        slopes = steps.lifting.slopes(x, values, (*steps.lifting.states, self.name))
         steps.step(y, u)
         if self.observer.bank is not None:  # measurements take the place of estimates
             self._s[:, self._C] = 0.0
-        lifted = np.concatenate([self._s, (slopes @ self._s[..., None])[..., 0] + by_value], axis=-1)
+        lifted = np.concatenate([self._s, (slopes[..., :n] @ self._s[..., None])[..., 0] + slopes[..., n]], axis=-1)
         moved = lifted @ self._model.T + (self._s_c @ K.C.T - psi @ K.D.T) @ self._into.T
         self._s, self._s_c = moved, self._s_c @ K.A.T - psi @ K.B.T
         self._power += self.forget * (np.sum((psi / self._sizes) ** 2, axis=-1) - self._power)
@@ -85,7 +82,7 @@ class PhaseLockedLoop:
         pull = np.sum(psi * nu / self._sizes**2, axis=-1) * self._weight
         usable = (self._power > 0) & np.isfinite(pull) & ~steps.waiting
         seen = np.divide(pull, self._power, out=np.zeros_like(pull), where=usable)
-        return np.asarray(values[self.name] + self.forget * np.clip(seen, -MOST, MOST))
+        return values[self.name] + self.forget * np.clip(seen, -MOST, MOST)
 
 
 def measurement_sizes(observer: ObserverData) -> Array:
@@ -113,9 +110,7 @@ def least_innovation(
     values, batch, k = np.asarray(candidates, dtype=float), y.shape[1], np.arange(len(y))[:, None]
     counted = np.isfinite(y) & ((k >= lengths // 4) & (k < lengths))[..., None]
     y, u = (np.tile(signal, (1, len(values), 1)) for signal in (y, u))
-    own = {p: np.full(batch * len(values), v) for p, v in observer.own(parameters).items()} | {
-        name: np.repeat(values, batch)
-    }
+    own = {**observer.own(parameters), name: np.repeat(values, batch)}
     error = ((y - run_observer(observer, y, u, own)[..., list(observer.measured)]) / measurement_sizes(observer)) ** 2
     counted = np.tile(counted, (1, len(values), 1))
     return float(values[np.argmin(np.where(counted, error, 0.0).reshape(len(y), len(values), -1).sum(axis=(0, 2)))])

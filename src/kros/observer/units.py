@@ -33,18 +33,30 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     x, u = factors(observer, sizes)
     y, K = x[list(observer.measured)], observer.controller
     into = u if observer.injection is Injection.INPUT else x
+    observer = in_coordinates(observer, np.diag(x))
+    by = {"seen": (y, u[: len(observer.inputs)]), "monitor": (y,), "bank": (np.concatenate([x, u]), y)}
+    parts = {name: getattr(observer, name) for name in by}
+    changed: dict[str, Any] = {name: part.times(*by[name]) for name, part in parts.items() if part is not None}
     return replace(
         observer,
         lifting=lifting,
-        A=observer.A * x[:, None] / x,
-        B=observer.B * x[:, None] / u,
+        B=observer.B / u,
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
         runtime=observer.runtime.times(x[: lifting.n_states]),
-        seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
-        monitor=None if observer.monitor is None else observer.monitor.times(y),
-        guard=None if observer.guard is None else observer.guard.times(x[: lifting.n_states]),
-        bank=None if observer.bank is None else observer.bank.times(x[: lifting.n_states], np.concatenate([x, u]), y),
-        sensor=in_units(observer.sensor, {lifting.states[i]: 1 / float(x[i]) for i in observer.measured}),
+        sensor=in_units(observer.sensor, dict(zip(observer.outputs, (1 / y).tolist(), strict=True))),
+        **changed,
+    )
+
+
+def in_coordinates(observer: O, turn: Array) -> O:
+    """Return the model, the bank and the guard in coordinates ``turn @ theta``, shape (n_lifted, n_lifted)."""
+    n, bank, guard = observer.lifting.n_states, observer.bank, observer.guard
+    return replace(
+        observer,
+        A=turn @ observer.A @ np.linalg.inv(turn),
+        B=turn @ observer.B,
+        bank=None if bank is None else replace(bank, start=turn[:n, :n] @ bank.start),
+        guard=None if guard is None else guard.turned(turn[:n, :n]),
     )
 
 

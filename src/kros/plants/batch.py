@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -70,6 +70,10 @@ class BatchSettings:
 
     plant: ClassVar[str]
     least_seconds: ClassVar[float] = 1.0
+    serial: ClassVar[tuple[int, int]] = (1, 3)  # of the first unit, and its digits
+    outlier_stream: ClassVar[tuple[int, ...]] = (OUTLIER_STREAM,)
+    parameters: ClassVar[Mapping[str, tuple[float, float]]]  # nominal value, deviation of its logarithm at spread 1
+    outlier_log_factors: ClassVar[Mapping[str, float]]  # on each parameter at severity s: exp(s value)
 
     def __post_init__(self) -> None:
         for name, (low, high) in (_LIMITS | {"seconds": (self.least_seconds, 3600)}).items():
@@ -80,6 +84,22 @@ class BatchSettings:
     def random(self, *stream: int) -> np.random.Generator:
         """Return the generator of one stream of random numbers."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=stream))
+
+    def units(self) -> tuple[tuple[Unit, ...], dict[str, Array]]:
+        """Draw the units, the outlier in front of them, and their parameters by name."""
+        first, digits = self.serial
+        units = [Unit(f"{first + k:0{digits}d}", "population") for k in range(self.n_units)]
+        drawn = [self.draw(self.random(UNIT_STREAM, k)) for k in range(self.n_units)]
+        if self.outlier:
+            bad, factors = self.draw(self.random(*self.outlier_stream)), self.outlier_log_factors
+            units.insert(0, Unit(digits * "0", OUTLIERS))
+            drawn.insert(0, {n: v * np.exp(self.outlier_severity * factors.get(n, 0.0)) for n, v in bad.items()})
+        return tuple(units), {n: np.array([d[n] for d in drawn]) for n in drawn[0]}
+
+    def draw(self, rng: np.random.Generator) -> dict[str, Any]:
+        """Draw the parameters of one unit."""
+        kinds = self.parameters.items()
+        return {n: v * float(np.exp(self.spread * dev * rng.standard_normal())) for n, (v, dev) in kinds}
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +135,13 @@ class UnitTruth(ABC):
 
     def as_dict(self) -> dict[str, Any]:
         """Return all parameters, ready for JSON: one entry per unit."""
-        names = [f.name for f in fields(self) if f.name != "unit_ids"]
-        values = {u: {n: float(getattr(self, n)[i]) for n in names} for i, u in enumerate(self.unit_ids)}
-        return {"plant": self.plant, "units": values}
+        return {"plant": self.plant, "units": by_unit(self.unit_ids, self)}
+
+
+def by_unit(units: Sequence[str], parameters: Any) -> dict[str, dict[str, Any]]:
+    """Return the fields of parameters, whose first axis is that of units, ready for JSON: one entry per unit."""
+    names = [f.name for f in fields(parameters) if f.name != "unit_ids"]
+    return {unit: {name: getattr(parameters, name)[i].tolist() for name in names} for i, unit in enumerate(units)}
 
 
 P = TypeVar("P", bound=UnitTruth)
@@ -130,8 +154,6 @@ class Batch(BatchSettings, ABC, Generic[P]):
     channels: ClassVar[tuple[Channel, ...]]
     truths: ClassVar[tuple[Channel, ...]] = ()
     noise: ClassVar[tuple[float, ...]]  # standard deviations of the sensors behind the encoder
-    parameters: ClassVar[Mapping[str, tuple[float, float]]]  # nominal value, deviation of its logarithm at spread 1
-    outlier_log_factors: ClassVar[Mapping[str, float]]
 
     @abstractmethod
     def reference(self, rng: np.random.Generator, n_samples: int) -> Array:
@@ -139,7 +161,8 @@ class Batch(BatchSettings, ABC, Generic[P]):
 
     def simulate(self) -> SimulatedPopulation[P]:
         """Simulate all episodes of all units."""
-        units, truth = self._units()
+        units, values = self.units()
+        truth = self.truth(tuple(u.id for u in units), **values)
         n_samples = round(self.seconds / truth.sample_period_s)
         inputs = np.stack([self.reference(self.random(INPUT_STREAM, e), n_samples) for e in range(self.n_episodes)])
         states, names = truth.respond(inputs), [c.name for c in self.channels]
@@ -157,19 +180,3 @@ class Batch(BatchSettings, ABC, Generic[P]):
         columns, about = (*self.channels, *self.truths), {"plant": truth.plant}
         population = assemble(SimulatedEpisodes(parts), columns, units, truth.sample_period_s, about)
         return SimulatedPopulation(population, population, truth)
-
-    def _units(self) -> tuple[tuple[Unit, ...], P]:
-        """Draw the units, and the outlier in front of them."""
-        units = [Unit(f"{k + 1:03d}", "population") for k in range(self.n_units)]
-        drawn = [self._draw(self.random(UNIT_STREAM, k)) for k in range(self.n_units)]
-        if self.outlier:
-            bad = self._draw(self.random(OUTLIER_STREAM))
-            factors = {n: np.exp(self.outlier_severity * self.outlier_log_factors.get(n, 0.0)) for n in bad}
-            units.insert(0, Unit("000", OUTLIERS))
-            drawn.insert(0, {n: v * factors[n] for n, v in bad.items()})
-        values = {n: np.array([d[n] for d in drawn]) for n in self.parameters}
-        return tuple(units), self.truth(tuple(u.id for u in units), **values)
-
-    def _draw(self, rng: np.random.Generator) -> dict[str, float]:
-        kinds = self.parameters.items()
-        return {n: v * float(np.exp(self.spread * dev * rng.standard_normal())) for n, (v, dev) in kinds}

@@ -149,7 +149,7 @@ def _observers(context: Context) -> dict[str, Any]:
 def _deployment(context: Context) -> dict[str, Any]:
     """Return what the deployed observer reads, estimates and needs of its sensors."""
     observer = Observer.load(context.store.path("observers", "deployed.json"))
-    measured, sizes = [observer.lifting.states[i] for i in observer.measured], observer.about["largest_in_training"]
+    measured, sizes = observer.outputs, observer.about["largest_in_training"]
     return {
         "measured": measured,
         "inputs": list(observer.inputs),

@@ -61,7 +61,7 @@ class CompiledObserver:
         self.name, self.states = manifest["name"], tuple(manifest["states"])
         self.parameters, self.state_bytes = tuple(manifest["parameters"]), int(manifest["state_bytes"])
         self._q, self._m = len(manifest["measured"]), len(manifest["inputs"])
-        self._real = np.float32 if manifest["precision"] == "float" else np.float64
+        self._real = ctypes.c_float if manifest["precision"] == "float" else ctypes.c_double
         self._c = ctypes.CDLL(str(library))
         self._run = self._c[f"{self.name}_run"]
         self._reset = self._c[f"{self.name}_reset{_wide(manifest)}"]
@@ -123,10 +123,9 @@ class CompiledObserver:
     def start(self, y: Array, parameters: Mapping[str, float] | None = None) -> Machine:
         """Return the state of a machine that starts at a measurement, shape (q,), as the C source keeps it."""
         machine = np.zeros(self.state_bytes, dtype=np.uint8)
-        real = ctypes.c_float if self._real is np.float32 else ctypes.c_double
         self._c[f"{self.name}_init"](_at(machine))
         for name, value in (parameters or {}).items():
-            self._c[f"{self.name}_set_{name}"](_at(machine), real(value))
+            self._c[f"{self.name}_set_{name}"](_at(machine), self._real(value))
         self._reset(_at(machine), _at(np.ascontiguousarray(y, dtype=float)))
         return machine
 

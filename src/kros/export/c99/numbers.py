@@ -88,14 +88,15 @@ class Source:
 
     def layout(self) -> dict[str, Any]:
         """Return names, units of measure, and numbers of states, channels and samples."""
-        o, factors, measured, lifting = self.observer, self.factors(), self.measured, self.observer.lifting
+        o, factors, measured, lifting = self.observer, self.factors(), self.observer.outputs, self.observer.lifting
         return {
             "name": self.name,
             "NAME": self.name.upper(),
             "observer_name": plain(o.name),
             "real": self.precision.type,
             "suffix": self.precision.suffix,
-            **{name: self.precision.literal(value) for name, value in (("zero", 0.0), ("one", 1.0))},
+            "zero": self.precision.literal(0.0),
+            "one": self.precision.literal(1.0),
             "single": self.precision.type == "float",
             "states": plain_names(o.recorded),
             "measured": plain_names(measured),
@@ -131,8 +132,8 @@ class Source:
 
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
-        o, q, bounds, sides = self.observer, len(self.measured), self.bounds(), self.observer.runtime.sides
-        largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
+        o, q, bounds, sides = self.observer, len(self.observer.measured), self.bounds(), self.observer.runtime.sides
+        largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, o.outputs))
         return {
             "clips_estimate": bool(o.runtime.limits()),
             **dict(zip(("lower", "upper"), map(row, sides(o.lifting.n_states)), strict=True)),
@@ -141,11 +142,6 @@ class Source:
             "u_bounds": bounds[q:],
             "default_parameters": self.row(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
         }
-
-    @property
-    def measured(self) -> list[str]:
-        """Names of the measured states."""
-        return [self.observer.lifting.states[i] for i in self.observer.measured]
 
     def origin(self) -> dict[str, Any]:
         """Return how the origin moves; nothing where it cannot."""
@@ -161,7 +157,7 @@ class Source:
             "shift_others": [i for i in range(len(o.recorded)) if i != o.measured[0] and shift.states[i] != 0],
             "far": self.precision.literal(RULE.far * shift.period),
             "period": DOUBLE.literal(shift.period),
-            "recorded_period": abs(shift.period / self.factors()[self.measured[0]]),
+            "recorded_period": abs(shift.period / self.factors()[o.outputs[0]]),
         }
 
     def relative_input(self, j: int) -> str:
@@ -226,7 +222,7 @@ class Source:
             "load_name": plain(self.load.load),
             "current_name": plain(self.load.current),
             "factor": self.factor(self.load.current),
-            "angle_factor": self.factor(self.measured[0]),
+            "angle_factor": self.factor(self.observer.outputs[0]),
             "load": places.index(self.load.load),
             "current": places.index(self.load.current),
             "pole": write(level.pole),

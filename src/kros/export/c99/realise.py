@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ...core.rounding import ROUNDING
 from ...observer import Observer
+from ...observer.units import in_coordinates
 
 Array = npt.NDArray[np.float64]
 
@@ -72,17 +73,4 @@ def _modes(A: Array, scale: Array) -> Array:
     basis = np.array([part for pair in parts for part in pair]).T
     if basis.shape != A.shape or not A.size or np.linalg.cond(basis) > RULE.alike:
         return np.diag(1 / scale)
-    return np.asarray(np.linalg.inv(basis) / scale)
-
-
-def in_coordinates(observer: Observer, turn: Array) -> Observer:
-    """The observer in coordinates ``turn @ theta`` that leave recorded states and functions alone."""
-    n = observer.lifting.n_states
-    bank, guard = observer.bank, observer.guard
-    return replace(
-        observer,
-        A=turn @ observer.A @ np.linalg.inv(turn),
-        B=turn @ observer.B,
-        bank=None if bank is None else bank.turned(turn[:n, :n]),
-        guard=None if guard is None else guard.turned(turn[:n, :n]),
-    )
+    return np.linalg.inv(basis) / scale

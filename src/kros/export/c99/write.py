@@ -107,8 +107,9 @@ def c_files(
 def _golden(observer: Observer, source: Source, track: str | None, tolerance: float) -> dict[str, Any]:
     """Return the literals of golden vectors in the units of the recordings."""
     golden, factors = Golden.of(observer, track, tolerance=tolerance), source.factors()
-    measured = [observer.lifting.states[i] for i in observer.measured]
-    y, u, x = (np.array([factors[n] for n in names]) for names in (measured, observer.inputs, observer.recorded))
+    y, u, x = (
+        np.array([factors[n] for n in names]) for names in (observer.outputs, observer.inputs, observer.recorded)
+    )
     return {
         "y": [[_sample(v) for v in row] for row in golden.y / y],
         "u": [[_sample(v) for v in row] for row in golden.u / u],
@@ -117,7 +118,10 @@ def _golden(observer: Observer, source: Source, track: str | None, tolerance: fl
         "last": [f"{int(s)}u" for s in golden.last_status],
         "sure": [[f"{int(bits)}u" for bits in row] for row in golden.sure],
         "passes": golden.passes,
-        "tolerance": [f"{tolerance * v:.9g}" for v in golden.size / np.abs(x)],
+        "tolerance": [
+            f"{tolerance * v:.9g}"
+            for v in np.maximum(np.abs(golden.x_hat).max(axis=0), np.finfo(float).tiny) / np.abs(x)
+        ],
     }
 
 
@@ -127,7 +131,7 @@ def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
         "name": context["name"],
         "precision": context["real"],
         "states": list(observer.recorded),
-        "measured": [observer.lifting.states[i] for i in observer.measured],
+        "measured": observer.outputs,
         "inputs": list(observer.inputs),
         "parameters": list(observer.lifting.parameters),
         "units_of_measure": {s["name"]: s["unit"] for s in context["signals"]},
@@ -170,7 +174,6 @@ class Golden:
     u: Array  # (n_samples, m)
     x_hat: Array  # (n_samples, n_recorded)
     status: npt.NDArray[Any]  # (n_samples,)
-    size: Array  # (n_recorded,)
     passes: int
     last_status: npt.NDArray[Any]  # (n_samples,)
     # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
@@ -203,5 +206,4 @@ class Golden:
         x_hat, status = run(1.0)
         turned = (run(1 - tolerance)[1] ^ status) | (run(1 + tolerance)[1] ^ status)  # at a threshold but for rounding
         sure = ~np.stack([turned[:count], turned[-count:]])
-        size = np.maximum(np.abs(x_hat).max(axis=0), np.finfo(float).tiny)
-        return cls(y, u, x_hat, status[:count], size, passes, status[-count:], sure)
+        return cls(y, u, x_hat, status[:count], passes, status[-count:], sure)

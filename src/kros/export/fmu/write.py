@@ -107,7 +107,6 @@ def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
         "units": units,
         "estimates": len(estimates),
         "variables": variables(observer, units, estimates),
-        "wide_parameters": [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters],
     }
     files = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
     if fmi == 3:

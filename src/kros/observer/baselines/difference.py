@@ -26,26 +26,23 @@ class FilteredDifference:
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Estimate the rates from y (n_samples, batch, q), from rest; (n_samples, batch, n), NaN for other states."""
+        from scipy.signal import butter, lfilter
+
         del u, parameters
         y, estimate = hold_missing(y), np.full((*y.shape[:2], self.n_states), np.nan)
+        low_pass = butter(2, self.cutoff_hz, fs=1 / self.sample_period_s)
         for number, (measurement, state) in enumerate(self.pairs):
             rate = np.zeros(y.shape[1::-1])
             rate[:, 2:] = np.diff(y[:-1, :, measurement].T, axis=1) / self.sample_period_s
-            estimate[..., state] = (self.scales[number] if self.scales else 1.0) * self._smoothed(rate).T
+            estimate[..., state] = (self.scales[number] if self.scales else 1.0) * lfilter(*low_pass, rate).T
         return estimate
-
-    def _smoothed(self, signals: Array) -> Array:
-        """Pass signals, shape (..., n_samples), through the filter, from rest."""
-        from scipy.signal import butter, lfilter
-
-        return np.asarray(lfilter(*butter(2, self.cutoff_hz, fs=1 / self.sample_period_s), signals))
 
     def scaled_to(self, batch: EpisodeBatch, measured: Sequence[int]) -> FilteredDifference:
         """Return the same with the scales that fit recordings best, so that units of measure do not matter."""
         y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
         rates, states = replace(self, scales=()).run(y, y[..., :0])[inside], batch.states[inside]
-        products = [(rates[:, i] @ rates[:, i], rates[:, i] @ states[:, i]) for _, i in self.pairs]
-        return replace(self, scales=tuple(float(along / power) if power else 1.0 for power, along in products))
+        power, along = (rates**2).sum(axis=0), (rates * states).sum(axis=0)
+        return replace(self, scales=tuple(float(along[i] / power[i]) if power[i] else 1.0 for _, i in self.pairs))
 
 
 def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:

@@ -54,7 +54,6 @@ class ExtendedKalman:
         require_samples("the extended Kalman filter", len(self.measured), self.inputs, y, u)
         lifting, n, C, (n_samples, batch) = self.lifting, self.lifting.n_states, list(self.measured), y.shape[:2]
         values = {**self.parameters, **(parameters or {})}
-        values = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,)) for name, v in values.items()}
         if self.delay:
             return self._late(y, u, values)
         Q = self.Q.reshape(-1, 1, n, n)
@@ -83,9 +82,10 @@ class ExtendedKalman:
 
     def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
         """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""
-        PC, nu = P[..., list(self.measured)], y - x[..., list(self.measured)]
-        S, lost = PC[..., list(self.measured), :] + self.R, np.atleast_1d(~np.isfinite(y).all(axis=-1))
-        L, nu = np.where(lost[:, None, None], 0.0, PC @ np.linalg.inv(S)), np.where(lost[:, None], 0.0, nu)
+        C = list(self.measured)
+        PC, nu, lost = P[..., C], y - x[..., C], np.asarray(~np.isfinite(y).all(axis=-1, keepdims=True))
+        S = PC[..., C, :] + self.R
+        L, nu = np.where(lost[..., None], 0.0, PC @ np.linalg.inv(S)), np.where(lost, 0.0, nu)
         return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
     def _late(self, y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
@@ -109,4 +109,4 @@ def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:
     """Return the covariance of the first estimate: a state anywhere in its range, a measured one with noise."""
     P0 = np.diag(scale**2)
     P0[np.ix_(list(measured), list(measured))] = R
-    return np.asarray(P0)
+    return P0

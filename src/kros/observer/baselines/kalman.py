@@ -17,7 +17,6 @@ Array = npt.NDArray[np.float64]
 
 def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
     """Sweep the size of white process noise over sixteen decades, the covariance itself among them."""
-    shape = np.diag(shape**2) if shape.ndim == 1 else shape
     base = like_measurement_noise(C @ shape @ C.T, R)
     for level in sorted((1 / base, *np.logspace(-6, 10, 9).tolist())):
         try:

@@ -45,17 +45,14 @@ class Learned:
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n)."""
-        from scipy.fft import irfft, next_fast_len, rfft
+        from scipy.signal import oaconvolve
 
         del parameters
-        delays, samples = len(self.weights), len(y)
         z = np.concatenate([hold_missing(y), u], axis=-1)
         first, moved = z[0], np.concatenate([np.zeros((1, *z.shape[1:])), z[:-1] - z[0]])
-        size = next_fast_len(samples + delays, real=True)
-        spectrum = rfft(moved, size, axis=0)[:, :, None] @ rfft(self.weights, size, axis=0)[:, None]
+        parts = oaconvolve(moved[..., None], self.weights[:, None], axes=0)[: len(y)]
         estimate = np.full((*y.shape[:-1], len(self.measured) + len(self.estimated)), np.nan)
-        estimate[..., list(self.estimated)] = irfft(spectrum[:, :, 0], size, axis=0)[:samples]
-        estimate[..., list(self.estimated)] += self.constant + first @ self.weights.sum(axis=0)
+        estimate[..., list(self.estimated)] = parts.sum(axis=2) + self.constant + first @ self.weights.sum(axis=0)
         return estimate
 
 

@@ -30,6 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DimensionError, KrosError
+from ...core.linalg import floats
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ROUNDING
 from ...lifting.formula import delayed_name
@@ -74,16 +75,13 @@ class ReliftScales:
     noise: Array
 
     def __post_init__(self) -> None:
-        for name in ("error", "residual", "noise"):
-            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            object.__setattr__(self, name, values)
-            sized = (
-                np.all(values > 0) and np.isfinite(values).any()
-                if name == "error"
-                else np.isfinite(values).all() and np.all(values >= 0)
+        floats(self, "error", "residual", "noise")
+        counted, others = np.isfinite(self.error), np.append(self.residual, self.noise)
+        if not (np.all(self.error > 0) and counted.any() and np.isfinite(others).all() and np.all(others >= 0)):
+            raise DimensionError(
+                "Re-lift scales: errors should be finite sizes above zero, some of them infinite, residuals and noise "
+                f"finite and not negative, found {self}."
             )
-            if not sized:
-                raise DimensionError(f"Re-lift scales: {name} should be finite sizes above zero, found {values}.")
 
     @classmethod
     def typical(cls, ranges: npt.ArrayLike, residual: Array, noise: npt.ArrayLike) -> ReliftScales:
@@ -92,9 +90,9 @@ class ReliftScales:
         Of ranges, shape (n,), one-step residuals of the population, shape (..., n), and the standard deviation of every
         measurement's noise, shape (q,).
         """
-        n, sigma = residual.shape[-1], np.atleast_1d(np.asarray(noise, dtype=float))
+        n, sigma = residual.shape[-1], np.atleast_1d(noise)
         rms = np.sqrt(np.mean(residual.reshape(-1, n) ** 2, axis=0))
-        return cls(np.asarray(ranges, dtype=float), rms * np.sqrt(n), sigma * np.sqrt(len(sigma)))
+        return cls(np.asarray(ranges), rms * np.sqrt(n), sigma * np.sqrt(len(sigma)))
 
     @classmethod
     def ones(cls, observer: ObserverData) -> ReliftScales:
@@ -143,10 +141,6 @@ class ErrorSystem:
         A, B = self.corner(d)
         return StateSpace(A, B, self.C, np.zeros((len(self.C), B.shape[1])), self.dt)
 
-    def moved(self) -> StateSpace:
-        """Return the system from w to q, what the channels act on, with slopes in the middle: the frozen response."""
-        return StateSpace(self.A, self.B, self.M, self.D, self.dt)
-
     def mismatch(self) -> ErrorSystem:
         """Return the system from q' (frozen) to the rest: ``r+ = A r + L p``, ``p = d (M r + E p + q')``."""
         width = self.L.shape[1]
@@ -187,7 +181,7 @@ class _Assembly:
         self.following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, self.h - n))]) + self.columns @ middle
         for row, (name, lag) in enumerate(lags[n:], n):
             self.following[row, lags.index((name, lag - 1))] = 1.0
-        self.slots, self.counted = _driven(observer, scales, self.h), _counted(scales)
+        self.slots, self.counted = _driven(observer, scales, self.h), np.flatnonzero(np.isfinite(scales.error))
         self.link = len(self.moving)
         late = self.delay * len(self.slots) + len(self.counted) if self.delay else 0
         self.sizes = (self.h + self.order + late, self.link * (self.delay + 1), n + q)
@@ -255,15 +249,11 @@ def _driven(observer: ObserverData, scales: ReliftScales, h: int) -> list[int]:
     return [i for i in range(h) if i < n - observer.internal or i >= n or scales.residual[i] > 0]
 
 
-def _counted(scales: ReliftScales) -> list[int]:
-    """Return the states whose errors count."""
-    return [int(i) for i in np.flatnonzero(np.isfinite(scales.error))]
-
-
 def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> Array:
     """Return the sizes of xi, shape (n_xi,), from those of the errors, shape (n_window,)."""
     delay = observer.runtime.delay
-    late = [*[errors[_driven(observer, scales, len(errors))]] * delay, errors[_counted(scales)]] if delay else []
+    counted = errors[: len(scales.error)][np.isfinite(scales.error)]
+    late = [*[errors[_driven(observer, scales, len(errors))]] * delay, counted] if delay else []
     return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
 
 

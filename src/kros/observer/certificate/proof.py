@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace
-from ...core.norms import gramian, hinf_norm
+from ...core.norms import first_frequencies, gramian, hinf_norm, to_continuous
 from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 from .error import ErrorSystem
 
@@ -45,7 +45,6 @@ Integers = npt.NDArray[Any]
 class ProofSettings:
     """How a proof is looked for; a gain that is proven is one whatever these are."""
 
-    frequencies: int = 200  # of the grid, beside those of the poles
     accuracy: float = 5e-4  # of the least squared gain on the grid
     rounds: int = 60  # of cutting planes
     cuts: int = 30  # of a round
@@ -160,8 +159,7 @@ def _scaled(H: Complex, width: int) -> tuple[Array, Complex]:
 def _cuts(H: Complex, t: Array, g: float) -> Array:
     """Return rows (c, n_p + 2) of ``v' F_f(t, g) v = a t + b g - c`` for the eigenvectors of least value."""
     width = len(t)
-    weight = np.concatenate([t, np.ones(H.shape[1] - width)])
-    F = np.diag(np.append(t, np.full(H.shape[2] - width, g))) - np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
+    F = np.diag(np.append(t, np.full(H.shape[2] - width, g))) - _forms(H, t)
     values, vectors = np.linalg.eigh(F)
     some = np.argsort(values[:, 0])[: SETTINGS.cuts]
     v = vectors[some, :, 0]
@@ -172,11 +170,16 @@ def _cuts(H: Complex, t: Array, g: float) -> Array:
     )
 
 
+def _forms(H: Complex, t: Array) -> Complex:
+    """Return ``sum_j t_j h_fj' h_fj + H_z' H_z`` at every frequency."""
+    weight = np.append(t, np.ones(H.shape[1] - len(t)))
+    return np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
+
+
 def gain_squared(H: Complex, t: Array) -> float:
     """Return the least g that multipliers allow on the grid, by a Schur complement, or infinity."""
     width = len(t)
-    weight = np.concatenate([t, np.ones(H.shape[1] - width)])
-    F = np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
+    F = _forms(H, t)
     rest = np.diag(t) - F[:, :width, :width]
     if not np.linalg.eigvalsh(rest)[:, 0].min() > 0:
         return np.inf
@@ -185,17 +188,12 @@ def gain_squared(H: Complex, t: Array) -> float:
 
 
 def _responses(system: ErrorSystem) -> Complex:
-    """H at many frequencies: those of the poles and a logarithmic grid; shape (f, n_p + n_z, n_p + n_w)."""
+    """H at the frequencies at which `hinf_norm` begins; shape (f, n_p + n_z, n_p + n_w)."""
     C, D = np.vstack([system.M, system.C]), np.hstack([np.broadcast_to(system.E, 2 * (system.L.shape[1],)), system.D])
     D = np.vstack([D, np.zeros((len(system.C), D.shape[1]))])
     plant = StateSpace(system.A, np.hstack([system.L, system.B]), C, D, system.dt)
-    poles = np.log(plant.poles().astype(complex) + TINY)
-    nyquist, angle, width = 0.5 / system.dt, np.abs(poles.imag), np.abs(poles.real)
-    beside = np.maximum(angle + np.multiply.outer([-1.0, -0.5, 0.5, 1.0], width), 0.0).ravel()
-    marks = np.concatenate([angle, width, np.abs(poles), beside]) / (2 * np.pi * system.dt)
-    low = max(min(marks[marks > 0].min(initial=nyquist), nyquist) / 30, ITERATED * nyquist)
-    grid = np.geomspace(low, nyquist, SETTINGS.frequencies)
-    return plant.frequency_response(np.unique(np.concatenate([[0.0], grid, marks[marks <= nyquist]])))
+    nu = first_frequencies(to_continuous(plant).poles())
+    return plant.frequency_response(np.unique(np.append(np.arctan(nu) / (np.pi * system.dt), 0.5 / system.dt)))
 
 
 def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Array | None:

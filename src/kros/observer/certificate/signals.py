@@ -29,7 +29,7 @@ from ..residual.one_step import one_step_residual
 from ..screen import screened
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
-from .error import ErrorSystem, ReliftScales, error_system
+from .error import ErrorSystem, ReliftScales
 from .proof import proven_gain
 
 Array = npt.NDArray[np.float64]
@@ -52,7 +52,7 @@ class SignalBound:
     def cover(self) -> Array:
         """Bound on the RMS error of every state over all units but those outside, shape (n,)."""
         inside = [unit not in self.outside for unit in self.units]
-        return np.asarray(self.bounds[inside].max(axis=0, initial=-np.inf if any(inside) else np.inf))
+        return self.bounds[inside].max(axis=0, initial=-np.inf if any(inside) else np.inf)
 
     @property
     def certified(self) -> bool:
@@ -63,7 +63,7 @@ class SignalBound:
     def ratios(self) -> Array:
         """Bounds over errors, shape (units, n)."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(self.errors > 0, self.bounds / self.errors, np.inf))
+            return np.where(self.errors > 0, self.bounds / self.errors, np.inf)
 
     def percent(self) -> dict[str, float | None]:
         """Return the bound by state, percent of the range; None where there is none."""
@@ -76,11 +76,14 @@ class SignalBound:
             return {"set_certified": False, "set_reason": self.reason}
         hidden = [j for j in range(len(self.states)) if j not in measured] or list(range(len(self.states)))
         ratios = self.ratios[:, hidden]
-        ratios = ratios[np.isfinite(ratios)]
-        facts: dict[str, Any] = {"set_certified": True, "set_bound_percent": self.percent()}
-        least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
-        ratio = {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
-        return facts | ratio | {"set_outside": list(self.outside)}
+        finite = ratios[np.isfinite(ratios)].tolist()
+        return {
+            "set_certified": True,
+            "set_bound_percent": self.percent(),
+            "set_bound_to_error_min": min(finite, default=None),
+            "set_bound_to_error_max": max(finite, default=None),
+            "set_outside": list(self.outside),
+        }
 
     def in_sizes(self, factors: npt.ArrayLike) -> SignalBound:
         """Return the same for states in other units of measure, by their factors, shape (n,)."""
@@ -104,7 +107,7 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
         return replace(result, reason="it has no certificate at run time")
     ones = np.ones(observer.lifting.n_states), np.ones(len(observer.measured))
     scales = ReliftScales(certificate.scales.error, *ones)
-    system = error_system(observer, scales, certificate.box, certificate.parameters)
+    system = replace(certificate, scales=scales).system(observer)
     w = np.concatenate([seen.omega, seen.noise], axis=-1)
     frozen, acted = (rms(signal) for signal in frozen_response(system, w, seen.first))
     share = np.maximum(acted.max(axis=0), TINY)
@@ -154,23 +157,23 @@ class Course:
     def mean_square(self, signal: Array) -> Array:
         """Return the mean square of every channel over every episode, shape (batch, k)."""
         inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
-        return np.asarray(np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None])
+        return np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None]
 
     def taken(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
         """Whether the observer takes all samples, shape (batch,)."""
         samples = screened(observer, self.y, self.inputs)
         good = np.isfinite(samples.y).all(axis=-1) & (samples.u == self.inputs).all(axis=-1)
-        return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
+        return (good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0)
 
 
-def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None) -> Course:
+def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     """Return what drove an observer along episodes; recorded states stand for the true ones."""
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
     states = observer.runtime.clip_estimate(batch.states)
-    values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
+    values = {**observer.parameters, **observer.own(batch.parameters)}
     due = np.maximum(np.arange(len(states)) - late, 0)
     y = batch.states[due][..., at] if batch.shown is None else batch.measurements(at, arrived=False)
-    estimates = run_observer(observer, y, inputs, values) if estimates is None else estimates
+    estimates = run_observer(observer, y, inputs, values)
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
     taken = screened(observer, y, inputs).y
     noise = np.where(np.isfinite(taken), taken, y)[:-1] - states[due][:-1][..., at]
@@ -181,7 +184,7 @@ def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None 
 
 
 def held_residual(
-    observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None
+    observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike]
 ) -> Array:
     """Return the one-step residual, shape (n_samples - 1, batch, n); values before the first sample equal it."""
     h = observer.lifting.history

@@ -22,7 +22,6 @@ from .channels import Channels
 from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
-_BLOCK = 64  # samples that are summed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +48,7 @@ class Bank:
         return self.channels - 1 - self.memoryless
 
     def __len__(self) -> int:
-        moving = self.channels - 1
-        return (
-            moving
-            + self.delayed * (len(self.taps) - 2)
-            + moving * len(self.lags)
-            + self.channels * len(self.starts)
-            + 1
-        )
+        return len(self.channel)
 
     @property
     def channel(self) -> npt.NDArray[np.int64]:
@@ -80,22 +72,21 @@ class Bank:
 
     def sizes(self, rms: Array) -> Array:
         """Return the sizes of entries, their RMS; for the start that of its constant, since machines start at rest."""
-        size, count = rms.copy(), len(self.starts) * self.channels
-        size[-1 - count : -1] = np.repeat(rms[-1 - count : -1].reshape(-1, self.channels)[:, -1], self.channels)
+        size, first = rms.copy(), self._first
+        size[first] = np.repeat(rms[first][self.channels - 1 :: self.channels], self.channels)
         return np.maximum(size, ITERATED * size.max())
 
     def trust(self, settings: EstimatorSettings) -> Array:
         """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
-        linear = np.arange(self.channels - 1) < self.linear
-        own = np.where(linear, 0.0, settings.nonlinear_trust)
-        first = np.append(np.full(self.channels - 1, settings.start_trust), 0.0)
-        parts = [
-            own,
-            *[own[: self.delayed]] * (len(self.taps) - 2),
-            *[own] * len(self.lags),
-            *[first] * len(self.starts),
-        ]
-        return np.concatenate([*parts, [0.0]])
+        channel = self.channel
+        trust = np.where(channel < self.linear, 0.0, settings.nonlinear_trust)
+        trust[self._first] = settings.start_trust
+        return np.where(channel < self.channels - 1, trust, 0.0)
+
+    @property
+    def _first(self) -> slice:
+        """Entries of the first sample."""
+        return slice(-1 - len(self.starts) * self.channels, -1)
 
     @property
     def fine(self) -> Bank:
@@ -140,21 +131,7 @@ class Bank:
 
 
 def lagged(v: Array, a: Array, at: npt.NDArray[np.int64]) -> Array:
-    """Return ``h_k = a h_{k-1} + (1 - a) v_k``, ``h_{-1} = v_0``, at some samples, shape (len(at), a by channels).
-
-    Sums over whole blocks of samples lead to the block of a sample, and a sum within it to the sample.
-    """
+    """Return ``h_k = a h_{k-1} + (1 - a) v_k``, ``h_{-1} = v_0``, at some samples, shape (len(at), a by channels)."""
     from scipy.signal import lfilter
 
-    inside, blocks = np.arange(_BLOCK), len(v) // _BLOCK
-    weights = (1 - a)[:, None] * a[:, None] ** inside
-    whole = v[: blocks * _BLOCK].reshape(blocks, _BLOCK, v.shape[1])
-    sums = np.tensordot(weights[:, ::-1], whole, (1, 1))
-    through = a**_BLOCK
-    ends = [lfilter([1.0], [1.0, -b], each, axis=0, zi=b * v[:1])[0] for b, each in zip(through, sums, strict=True)]
-    before = np.concatenate([np.broadcast_to(v[:1], (len(a), 1, v.shape[1])), ends], axis=1)
-    block, place = np.divmod(at, _BLOCK)
-    latest = v[np.maximum(at[:, None] - inside, 0)]
-    within = np.where(inside <= place[:, None], weights[:, None], 0.0).swapaxes(0, 1) @ latest
-    rest = (a ** (place[:, None] + 1))[..., None] * before[:, block].swapaxes(0, 1)
-    return np.asarray(within + rest).reshape(len(at), -1)
+    return np.hstack([lfilter([1 - b], [1, -b], v, axis=0, zi=b * v[:1])[0][at] for b in a])

@@ -16,7 +16,6 @@ from ...synthesis.result import Injection
 from ..filter_bank import FilterBank
 from ..observer import Observer
 from ..runtime import Runtime
-from .bank import Bank
 from .certificate import outside_percent
 from .channels import FAMILIES, Channels, channels_of
 from .gaps import with_gaps
@@ -88,43 +87,37 @@ def identify_estimator(
     readout, family = best_family(lifting, measured, inputs, recordings, settings, hidden)
     channels = readout.design.channels
     blind_channels = channels.without_measurements()
-    blind_bank = Bank.of(blind_channels, recordings.length, settings)
-    blind = Readout.of(Design(blind_channels, blind_bank, recordings, settings))
+    blind = Readout.of(Design.of(blind_channels, recordings, settings))
     held = [measured[i] for i in blind_channels.held]
     reach = settings.reach * recordings.size[list(measured)]
 
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
-        absolute = filters.absolute(channels), fallback.absolute(blind_channels)
-        own = name, lifting, inputs, channels, *absolute, sample_period_s, parameters or {}, reach
-        return assembled(*own)
+        return assembled(name, lifting, inputs, channels, (filters, fallback), sample_period_s, parameters or {}, reach)
 
-    filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
+    filters, fallback = (reduced(r, settings.order) for r in (readout, blind))
     observer = observer_of(filters, fallback)
     group, unseen = readout.left_out_group()
-    partial, rest = readout.without(group), blind.without(group)
-    trial = observer_of(
-        reduced(partial, errors_of(partial), len(filters.A), settings.loss),
-        reduced(rest, errors_of(rest), len(fallback.A), settings.loss),
-    )
+    smaller = (filters, readout), (fallback, blind)
+    trial = observer_of(*(reduced(r.without(group), len(f.A)) for f, r in smaller))
     assert observer.bank is not None
-    observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings, held))
-    observer = replace(observer, runtime=bounded(observer, recordings, settings.room))
+    bank = with_gaps(observer.bank, trial, unseen, settings, held)
+    observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings.room))
     states = lifting.states
-    errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)
+
+    def by_state(values: Array) -> dict[str, float]:
+        return dict(zip(states, values.tolist(), strict=True))
+
+    errors = readout.typical
     growth = errors / np.exp(np.log(readout.trained).mean(axis=0) / 2)
     worst = np.sqrt(readout.episode_errors().max(axis=0))
     facts = {
         "channels": family,
         "filters": len(filters.A),
-        "input_filters": len(fallback.A),
-        "bank": len(readout.design.bank),
-        "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
-        "penalties": dict(zip(states, readout.penalties.tolist(), strict=True)),
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
-        "left_out_worst_percent": dict(zip(states, (100 * worst).tolist(), strict=True)),
-        "outside_models_percent": dict(zip(states, outside_percent(readout, lifting).tolist(), strict=True)),
-        "settle_samples": settle_samples(filters, fallback, observer.bank),
+        "left_out_worst_percent": by_state(100 * worst),
+        "outside_models_percent": by_state(outside_percent(readout, lifting)),
+        "settle_samples": settle_samples((filters, fallback), bank.recovery),
     }
     return Identified(observer, readout, family, facts)
 
@@ -158,30 +151,16 @@ def best_family(
 ) -> tuple[Readout, str]:
     """Return the readout of the first family after which the next is not better by the margin on left-out units."""
     ranges = ranges_of(lifting, measured, inputs, recordings, settings)
-    best: Readout | None = None
-    chosen = FAMILIES[0]
+    best: list[tuple[Readout, str]] = []
     for family in FAMILIES:
-        channels = channels_of(lifting, measured, inputs, family, ranges, settings)
-        design = Design(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
-        if best is not None and len(design.bank) == len(best.design.bank):
+        design = Design.of(channels_of(lifting, measured, inputs, family, ranges, settings), recordings, settings)
+        if best and len(design.bank) == len(best[-1][0].design.bank):
             break
         readout = Readout.of(design)
-        if best is not None and not is_better(readout, best, hidden, settings.margin):
+        if best and not is_less(readout.by_fold(hidden), best[-1][0].by_fold(hidden), settings.margin):
             break
-        best, chosen = readout, family
-    assert best is not None
-    return best, chosen
-
-
-def is_better(one: Readout, other: Readout, states: Sequence[int], margin: float) -> bool:
-    """Whether the left-out errors of one are smaller by so many paired standard errors over folds of units."""
-    difference = one.by_fold(states), other.by_fold(states)
-    return is_less(*difference, margin)
-
-
-def errors_of(readout: Readout) -> Array:
-    """Return the typical left-out error of every state in its unit, shape (n,)."""
-    return np.exp(np.log(readout.left_out).mean(axis=0) / 2) * readout.design.recordings.size
+        best.append((readout, family))
+    return best[-1]
 
 
 def ranges_of(
@@ -192,16 +171,11 @@ def ranges_of(
     settings: EstimatorSettings,
 ) -> dict[str, tuple[float, float]]:
     """Return the least and largest value of measured states and inputs in the units that formulas are written in."""
+    names = [*(lifting.states[i] for i in measured), *inputs]
     batches = [recordings.read(key) for key in recordings.some(settings.episodes).keys]
-    found = {}
-    names = [lifting.states[i] for i in measured]
-    for name, size in zip([*names, *inputs], lifting.sizes_of([*names, *inputs]), strict=True):
-        if name in names:
-            values = [b.measurements([lifting.states.index(name)])[..., 0] for b in batches]
-        else:
-            values = [b.inputs[..., list(inputs).index(name)] for b in batches]
-        found[name] = (float(size * min(np.nanmin(v) for v in values)), float(size * max(np.nanmax(v) for v in values)))
-    return found
+    values = np.vstack([np.concatenate([b.measurements(measured), b.inputs], axis=-1)[:, 0] for b in batches])
+    ends = lifting.sizes_of(names) * [np.nanmin(values, axis=0), np.nanmax(values, axis=0)]
+    return dict(zip(names, map(tuple, ends.T.tolist()), strict=True))
 
 
 def assembled(
@@ -209,40 +183,34 @@ def assembled(
     lifting: Lifting,
     inputs: Sequence[str],
     channels: Channels,
-    filters: Filters,
-    fallback: Filters,
+    systems: tuple[Filters, Filters],
     sample_period_s: float,
     parameters: Mapping[str, float],
     reach: Array,
 ) -> Observer:
-    """Write filters with their readouts into the model of an observer."""
+    """Write filters with their readouts, and those of inputs alone, into the model of an observer."""
+    without = channels.without_measurements()
+    filters, fallback = systems[0].absolute(channels), systems[1].absolute(without)
     n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
     bare = channels.lifting
     own = [*(f"filter_{i + 1}" for i in range(r)), *(f"input_filter_{i + 1}" for i in range(s))]
     widened = replace(bare, states=(*bare.states, *own, *(f"{state}_from_inputs" for state in bare.states)))
     total, columns = widened.n_states, widened.n_lifted + len(inputs) + len(bare.input_functions)
     places = [c if c < n else c + total - n for c in channels.columns]
-    blind = [c + total - n for c in channels.without_measurements().columns]
+    blind = [c + total - n for c in without.columns]
     z, w, u = (np.arange(a, b) for a, b in ((n, n + r), (n + r, n + r + s), (n + r + s, total)))
     x, at = np.arange(n), list(channels.measured)
     model, start = np.zeros((total, columns)), np.zeros((total, columns))
     first = filters.C @ filters.S + filters.D  # as if nothing had moved before: no step at the start
     first[at] = np.eye(len(at), len(channels))
-    for rows, states, inputs_of, system in (
-        (x, z, places, (filters.C, filters.D)),
-        (z, z, places, (filters.A, filters.B)),
-        (w, w, blind, (fallback.A, fallback.B)),
-        (u, w, blind, (fallback.C, fallback.D)),
+    for rows, states, inputs_of, *system in (
+        (x, z, places, filters.C, filters.D, first),
+        (z, z, places, filters.A, filters.B, filters.S),
+        (w, w, blind, fallback.A, fallback.B, fallback.S),
+        (u, w, blind, fallback.C, fallback.D, fallback.C @ fallback.S + fallback.D),
     ):
-        model[rows[:, None], states], model[rows[:, None], np.array(inputs_of)] = system
-    for rows, inputs_of, first_of in (
-        (x, places, first),
-        (z, places, filters.S),
-        (w, blind, fallback.S),
-        (u, blind, fallback.C @ fallback.S + fallback.D),
-    ):
-        start[rows[:, None], np.array(inputs_of)] = first_of
-    held = [at[i] for i in channels.without_measurements().held]
+        model[rows[:, None], states], model[rows[:, None], inputs_of], start[rows[:, None], inputs_of] = system
+    held = [at[i] for i in without.held]
     model[u[held], held] = 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
@@ -264,8 +232,8 @@ def assembled(
     )
 
 
-def settle_samples(filters: Filters, fallback: Filters, bank: FilterBank | None) -> int:
+def settle_samples(systems: Sequence[Filters], recovery: Array) -> int:
     """Return the samples after which a disturbance is below one percent: five of the slowest time constants."""
-    poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in (filters, fallback)]
-    slowest = max([*poles, *(bank.recovery if bank is not None else ())])
+    poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in systems]
+    slowest = max([*poles, *recovery])
     return int(np.ceil(-5 / np.log(slowest))) if slowest > 0 else 1

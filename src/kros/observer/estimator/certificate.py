@@ -98,7 +98,7 @@ def outside_percent(readout: Readout, modelled: Lifting) -> Array:
     outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
     rows, weight = design.sample
     added = rows[:, outside] @ readout.coefficients[outside]
-    return np.asarray(100 * np.sqrt(weight @ added**2) / design.recordings.size)
+    return 100 * np.sqrt(weight @ added**2) / design.recordings.size
 
 
 def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCertificate:
@@ -125,6 +125,5 @@ def left_out_bound(
 ) -> SignalBound:
     """Return the bound on RMS errors, the largest of left-out units, beside the errors (units, n) of training."""
     worst = np.array([worst_percent[name] for name in observer.recorded]) * sizes / 100
-    bound = np.maximum(worst, errors.max(axis=0))
-    each = np.repeat(bound[None], len(units), axis=0)
-    return SignalBound(observer.recorded, tuple(units), each, errors, sizes)
+    bound = np.maximum(worst, errors.max(axis=0)) + np.zeros_like(errors)  # one for all units
+    return SignalBound(observer.recorded, tuple(units), bound, errors, sizes)

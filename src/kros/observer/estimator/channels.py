@@ -80,15 +80,14 @@ class Channels:
             return v
         N, E = self.relative
         before = np.concatenate([v[:1], v[:-1]])
-        return np.asarray(v @ N.T - before @ E @ E.T)
+        return v @ N.T - before @ E @ E.T
 
     def signals(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike]) -> Array:
         """Return the channels of measurements (..., q) and inputs (..., m), shape (..., channels)."""
         x = np.zeros((*y.shape[:-1], self.lifting.n_states))
         x[..., list(self.measured)] = y
-        own = {name: parameters[name] for name in self.lifting.parameters}
-        lifted = self.lifting.lift(x, own)
-        return np.concatenate([lifted, self.lifting.lift_inputs(u, x, own)], axis=-1)[..., self.columns]
+        lifted = self.lifting.lift(x, parameters), self.lifting.lift_inputs(u, x, parameters)
+        return np.concatenate(lifted, axis=-1)[..., self.columns]
 
 
 def channels_of(
@@ -100,14 +99,13 @@ def channels_of(
     settings: EstimatorSettings,
 ) -> Channels:
     """Return the channels of a family, without functions that read states which are not measured."""
-    states = {lifting.states[i] for i in measured}
-    known = states | set(lifting.parameters)
+    names, nonlinear = [*(lifting.states[i] for i in measured), *inputs], list[str]()
+    known = {*names[: len(measured)], *lifting.parameters}
     functions = [f.text for f in lifting.formulas if f.used <= known]
     functions += [text for f in lifting.formulas if (text := quadrature(f.text, f.used, lifting)) and f.used <= known]
     of_inputs = [f.text for f in lifting.input_formulas if f.used <= known | set(inputs)]
     functions = list(dict.fromkeys(functions))
     linear = len(measured) + len(functions) + len(inputs) + len(of_inputs)
-    names, nonlinear = [*(lifting.states[i] for i in measured), *inputs], list[str]()
     groups = [(name, *together) for name, together in settings.unbounded.items()]
     free = {name for group in groups for name in group}
     y, u = ([name for name in some if name not in free] for some in (names[: len(measured)], inputs))

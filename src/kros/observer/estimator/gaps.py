@@ -22,19 +22,22 @@ _NEVER = 1e12  # samples: an age that no gap has
 _ROWS = 1000  # samples at a time
 
 
-def training(recordings: Recordings, settings: EstimatorSettings) -> tuple[Array, Array, Array, dict[str, Array]]:
+def training(
+    recordings: Recordings, at: Sequence[int], settings: EstimatorSettings
+) -> tuple[Array, Array, Array, dict[str, Array]]:
     """Return states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
     some = recordings.some(settings.gap_episodes)
     length = min(min(some.lengths), settings.gap_samples)
-    batches = [recordings.read(key) for key in some.keys]
+    batches = [recordings.read(key).head(length) for key in some.keys]
     again = np.arange(settings.gap_episodes) % len(batches)  # every episode is seen with several losses
-    states, inputs = (
-        np.concatenate([getattr(b, what)[:length] for b in batches], axis=1)[:, again] for what in ("states", "inputs")
+    signals = (
+        [b.states for b in batches],
+        [b.measurements(at, arrived=False) for b in batches],
+        [b.inputs for b in batches],
     )
-    arrived = [b.measurements(range(states.shape[-1]), arrived=False)[:length] for b in batches]
+    states, y, inputs = (np.concatenate(parts, axis=1)[:, again] for parts in signals)
     names = batches[0].parameters
-    parameters = {k: np.concatenate([b.parameters[k] for b in batches])[again] for k in names}
-    return states, np.concatenate(arrived, axis=1)[:, again], inputs, parameters
+    return states, y, inputs, {k: np.concatenate([b.parameters[k] for b in batches])[again] for k in names}
 
 
 def forgetting(apart: Array) -> Array:
@@ -72,11 +75,11 @@ def with_gaps(
     side, with the best of the others for each. A larger one, with which the filters go on by themselves for longer, has
     to be better by the margin. Fallbacks of states `held` go on from their last value by themselves.
     """
-    states, shown, inputs, parameters = training(recordings, settings)
-    batch, n, at = states.shape[1], len(trial.recorded), list(trial.measured)
+    n, at = len(trial.recorded), list(trial.measured)
+    states, y, inputs, parameters = training(recordings, at, settings)
+    batch, own = states.shape[1], trial.own(parameters)
     hidden = [i for i in range(n) if i not in at]
-    missing = losses(np.random.default_rng(settings.seed), *shown.shape[:2])
-    y, own = shown[..., at], trial.own(parameters)
+    missing = losses(np.random.default_rng(settings.seed), *y.shape[:2])
     forget = forgetting(states - recorded_estimates(trial, y, inputs, own)[..., n:])
     forget[list(held)] = 0.0
     longest = settings.blocks(recordings.length)[-1]
@@ -118,7 +121,7 @@ def earliest(errors: Array, half: Array, margin: float) -> npt.NDArray[np.int64]
     error = apart.std(axis=1, ddof=1) / np.sqrt(errors.shape[1]) if errors.shape[1] > 1 else 0.0
     alike = apart.mean(axis=1) <= margin * error
     least = np.where(alike, half[:, None], np.inf).min(axis=0)
-    return np.asarray(np.argmin(np.where(alike & (half[:, None] == least), mean, np.inf), axis=0))
+    return np.argmin(np.where(alike & (half[:, None] == least), mean, np.inf), axis=0)
 
 
 def blended_errors(

@@ -32,7 +32,6 @@ class Filters:
     C: Array  # (n, r)
     D: Array  # (n, channels)
     S: Array  # (r, channels)
-    singular_values: Array  # all of them, relative to the errors of the estimates
 
     def first(self, order: int) -> Filters:
         """Return the first states alone."""
@@ -52,12 +51,13 @@ class Filters:
     def along(self, v: Array) -> Array:
         """Return the estimates of signals v (n_samples, batch, channels), shape (n_samples, batch, n)."""
         z = recursion(self.A, v, v[0] @ self.S.T, self.B)
-        return np.asarray(z @ self.C.T + v @ self.D.T)
+        return z @ self.C.T + v @ self.D.T
 
 
-def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> Filters:
-    """Return the filters of a readout, reduced until errors (n,) of the estimates grow by a share, or to an order."""
+def reduced(readout: Readout, order: int | None = None) -> Filters:
+    """Return the filters of a readout, reduced until left-out errors grow by a share, or to an order."""
     design = readout.design
+    errors = readout.typical * design.recordings.size
     A, B, S = design.bank.fine.system()
     weights = design.bank.refined(readout.coefficients).T
     X, w = design.fine_sample
@@ -67,7 +67,6 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     C = weights * size @ A
     D = weights * size @ B
     used = np.isfinite(errors) & (errors > 0)
-    errors = errors.copy()
     errors[list(design.channels.measured)] *= design.settings.measured_loss
     root = gramian_root(A.T, (C[used] / errors[used, None]).T).T
     _, values, U = np.linalg.svd(root, full_matrices=False)
@@ -76,11 +75,11 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     _, sigma, V = np.linalg.svd((X / size * np.sqrt(w)[:, None]) @ L.T, full_matrices=False)
     scale = np.maximum(sigma, EPS * sigma[0])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
-    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
+    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S)
     if order is not None:
         return whole.first(order)
     signals = design.signals(some=_EPISODES, length=round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
-    wanted, most = whole.along(signals), 2 * loss
+    wanted, most = whole.along(signals), 2 * design.settings.loss
     low, high = 0, len(sigma)
     while high - low > 1:  # of errors that grow as little as asked, the least order
         middle = (low + high) // 2

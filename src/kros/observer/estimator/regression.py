@@ -93,16 +93,11 @@ class Recordings:
         """Median length of an episode in samples."""
         return float(np.median(self.lengths))
 
-    def some(self, count: int) -> Recordings:
-        """Return some episodes, spread over all."""
-        at = spread(range(len(self.keys)), count)
-        return self.only([i in at for i in range(len(self.keys))])
-
-    def some_of(self, groups: Mapping[EpisodeKey, Group], count: int) -> Recordings:
-        """Return some episodes, spread over those of every group, and one of each at least."""
-        members: dict[Group, list[EpisodeKey]] = {}
+    def some(self, count: int, groups: Mapping[EpisodeKey, Group] | None = None) -> Recordings:
+        """Return some episodes, spread over all or over those of every group, and one of each at least."""
+        members: dict[Group | None, list[EpisodeKey]] = {}
         for key in self.keys:
-            members.setdefault(groups[key], []).append(key)
+            members.setdefault((groups or {}).get(key), []).append(key)
         share = min(1.0, count / len(self.keys))
         kept = {key for keys in members.values() for key in spread(keys, max(1, round(share * len(keys))))}
         return self.only([key in kept for key in self.keys])
@@ -111,36 +106,18 @@ class Recordings:
         """Return the episodes that are flagged."""
         return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
 
-    def groups(self, folds: int, parts: int) -> list[Group]:
-        """Return the group of every episode: those of one name are in one part, and a unit is in one fold."""
-        names, units = sorted({key.episode for key in self.keys}), sorted({key.unit for key in self.keys})
-        return [
-            Group(units.index(key.unit) % folds, key.condition, names.index(key.episode) % parts) for key in self.keys
-        ]
 
+def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[npt.NDArray[np.int64], Array]]:
+    """Yield which samples of every episode are about so many rows, and for how many each stands.
 
-@dataclass(frozen=True)
-class Thinning:
-    """Which samples of an episode are rows, and for how many each stands: all at the start, then every `step`-th."""
-
-    first: int
-    step: int
-    first_step: int = 1
-
-    @classmethod
-    def of(cls, lengths: Sequence[int], rows: int, first: int) -> Thinning:
-        """Return the thinning that leaves about so many rows."""
-        first = min(first, min(lengths) - 1)
-        first_step = max(1, -(-3 * len(lengths) * first // rows))
-        left = max(1, rows - len(lengths) * (first // first_step))
-        return cls(first, max(1, -(-sum(lengths) // left)), first_step)
-
-    def at(self, length: int, number: int) -> tuple[npt.NDArray[np.int64], Array]:
-        """Return the samples of episode `number`, each of which has a sample after it, and their weights."""
-        early = np.arange(number % self.first_step, self.first, self.first_step)
-        late = np.arange(self.first + number % self.step, length - 1, self.step)
-        weights = np.repeat([float(self.first_step), float(self.step)], [len(early), len(late)])
-        return np.concatenate([early, late]), weights
+    Each has a sample after it. At the start they are denser than later.
+    """
+    first = min(first, min(lengths) - 1)
+    early = max(1, -(-3 * len(lengths) * first // rows))
+    late = max(1, -(-sum(lengths) // max(1, rows - len(lengths) * (first // early))))
+    for number, length in enumerate(lengths):
+        parts = np.arange(number % early, first, early), np.arange(first + number % late, length - 1, late)
+        yield np.concatenate(parts), np.repeat([float(early), float(late)], [len(part) for part in parts])
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +129,11 @@ class Design:
     recordings: Recordings
     settings: EstimatorSettings
 
+    @classmethod
+    def of(cls, channels: Channels, recordings: Recordings, settings: EstimatorSettings) -> Design:
+        """Return the design with the bank of its channels."""
+        return cls(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
+
     def rows(
         self, recordings: Recordings, rows: int, offset: Array | float = 0.0
     ) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
@@ -159,36 +141,35 @@ class Design:
 
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
         """
-        thinning = Thinning.of(recordings.lengths, rows, round(10 * max(self.settings.start)))
+        samples = thinned(recordings.lengths, rows, round(10 * max(self.settings.start)))
         measured = list(self.channels.measured)
-        for number, (key, length) in enumerate(zip(recordings.keys, recordings.lengths, strict=True)):
-            batch = recordings.read(key)
-            y = interpolated(batch.measurements(measured)[:length, 0]) + offset
-            v = self.channels.signals(y, batch.inputs[:length, 0], {k: p[0] for k, p in batch.parameters.items()})
-            at, weights = thinning.at(length, number)
-            targets = batch.states[at + 1, 0] / recordings.size
+        for key, (at, weights) in zip(recordings.keys, samples, strict=True):
+            states, y, v = self.episode(key, offset)
+            targets = states[at + 1] / recordings.size
             reference = v[at] @ self.channels.reference.T
             reference[:, self.channels.held] = y[at][:, self.channels.held]
             targets[:, measured] -= reference / recordings.size[measured]
             yield key, self.bank.rows(self.channels.filtered(v), at), targets, weights
 
+    def episode(self, key: EpisodeKey, offset: Array | float = 0.0) -> tuple[Array, Array, Array]:
+        """Return states, measurements with an offset, and channels of an episode, (n_samples, .)."""
+        batch = self.recordings.read(key)
+        length, own = batch.lengths[0], {k: p[0] for k, p in batch.parameters.items()}
+        y = interpolated(batch.measurements(self.channels.measured)[:length, 0]) + offset
+        return batch.states[:length, 0], y, self.channels.signals(y, batch.inputs[:length, 0], own)
+
     def signals(self, some: int, length: int) -> Array:
         """Return what filters see in some episodes, cut to one length, shape (n_samples, batch, channels)."""
-        found = []
-        for key in self.recordings.some(some).keys:
-            batch = self.recordings.read(key)
-            y = interpolated(batch.measurements(self.channels.measured)[: batch.lengths[0], 0])
-            own = {k: p[0] for k, p in batch.parameters.items()}
-            v = self.channels.signals(y, batch.inputs[: batch.lengths[0], 0], own)
-            found.append(self.channels.filtered(v))
-        shortest = min(length, *(len(v) for v in found))
-        return np.stack([v[:shortest] for v in found], axis=1)
+        recordings = self.recordings.some(some)
+        shortest = min(length, *recordings.lengths)
+        return np.stack([self.channels.filtered(self.episode(key)[2])[:shortest] for key in recordings.keys], axis=1)
 
     @cached_property
     def groups(self) -> dict[EpisodeKey, Group]:
-        """The group of every episode."""
-        found = self.recordings.groups(self.settings.folds, self.settings.parts)
-        return dict(zip(self.recordings.keys, found, strict=True))
+        """The group of every episode: those of one name are in one part, and a unit is in one fold."""
+        keys, folds, parts = self.recordings.keys, self.settings.folds, self.settings.parts
+        names, units = (sorted(set(column)) for column in zip(*((k.episode, k.unit) for k in keys), strict=True))
+        return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
 
     @cached_property
     def fine_sample(self) -> tuple[Array, Array]:
@@ -235,11 +216,12 @@ class Whitening:
         """Find the directions from thinned rows."""
         X, weights = design.sample
         size = design.bank.sizes(np.sqrt(weights @ (X * X)))
+        scale = np.sqrt(weights)[:, None] / size
         trust, bias = np.diag(design.bank.trust(design.settings)), design.recordings.bias
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
-            moved = (design.thinned(bias)[0] - X) / size * np.sqrt(weights)[:, None]
+            moved = (design.thinned(bias)[0] - X) * scale
             trust = np.vstack([trust, qr_triangle(moved)])
-        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X / size * np.sqrt(weights)[:, None], trust])))
+        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
         rows = trust @ (directions * size[:, None])
@@ -250,6 +232,7 @@ class Whitening:
 class Moments:
     """Second moments of every group in whitened directions."""
 
+    whitening: Whitening
     groups: tuple[Group, ...]
     gram: Array  # (groups, r, r)
     cross: Array  # (groups, r, n)
@@ -258,39 +241,37 @@ class Moments:
     @classmethod
     def of(cls, design: Design, whitening: Whitening) -> Moments:
         """Sum the rows of every group."""
-        sums: dict[Group, list[Array]] = {}
-        groups = design.groups
-        recordings = design.recordings.some_of(groups, design.settings.episodes)
+        sums, groups, r = dict[Group, Array](), design.groups, whitening.directions.shape[1]
+        recordings = design.recordings.some(design.settings.episodes, groups)
         for key, rows, targets, weights in design.rows(recordings, design.settings.rows):
-            group = groups[key]
-            F = (rows @ whitening.directions) * np.sqrt(weights)[:, None]
-            t = targets * np.sqrt(weights)[:, None]
-            parts = [F.T @ F, F.T @ t, (t * t).sum(axis=0), np.array(weights.sum())]
-            known = sums.get(group)
-            sums[group] = parts if known is None else [a + b for a, b in zip(known, parts, strict=True)]
-        gram, cross, power = (np.array([s[i] / s[3] for s in sums.values()]) for i in range(3))
-        return cls(tuple(sums), gram, cross, power)
+            columns = np.hstack([rows @ whitening.directions, targets, np.ones((len(rows), 1))])
+            columns *= np.sqrt(weights)[:, None]
+            sums[groups[key]] = sums.get(groups[key], 0.0) + columns.T @ columns
+        total = np.stack([*sums.values()])
+        total /= total[:, -1:, -1:]
+        power = np.diagonal(total, axis1=1, axis2=2)[:, r:-1]
+        return cls(whitening, tuple(sums), total[:, :r, :r], total[:, :r, r:-1], power)
 
     def of_groups(self, what: str) -> npt.NDArray[Any]:
         """Return fold, condition or part of every group."""
         return np.array([getattr(group, what) for group in self.groups])
 
-    def errors(self, coefficients: Array, groups: npt.NDArray[np.int64]) -> Array:
-        """Return the mean squared errors of coefficients (r, n) in some groups, shape (len(groups), n)."""
+    def errors(self, coefficients: Array, groups: slice = slice(None)) -> Array:
+        """Return the mean squared errors of coefficients (r, n) in some groups, shape (groups, n)."""
         quadratic = np.einsum("in,gin->gn", coefficients, self.gram[groups] @ coefficients)
         found = self.power[groups] - 2 * np.einsum("in,gin->gn", coefficients, self.cross[groups]) + quadratic
         return np.maximum(found, 1e-30)
 
-    def solved(self, whitening: Whitening, weights: Array, penalties: Sequence[float]) -> Iterator[Array]:
+    def solved(self, weights: Array, penalties: Sequence[float]) -> Iterator[Array]:
         """Yield ridge coefficients (r, n) of groups with weights, for every penalty."""
         from scipy.linalg import cho_factor, cho_solve
 
         weights = weights / weights.sum()
-        gram = np.tensordot(weights, self.gram, 1) + whitening.trust
+        gram = np.tensordot(weights, self.gram, 1) + self.whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 16 * len(gram) * EPS
         for penalty in penalties:
-            A = gram + np.diag(penalty * whitening.penalty)
+            A = gram + np.diag(penalty * self.whitening.penalty)
             q = 1 / np.sqrt(np.diag(A))
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
@@ -299,18 +280,13 @@ class Moments:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
         alike = self.of_groups("condition") == group.condition
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
-        for known in (folds & parts, folds, parts):
-            if (known & alike).any():
-                return known
-        return np.ones(len(folds), dtype=bool)
+        return next(known for known in (folds & parts, folds, parts, folds | True) if (known & alike).any())
 
-    def without(self, whitening: Whitening, weights: Array, penalties: Sequence[float]) -> dict[Group, list[Array]]:
+    def without(self, weights: Array, penalties: Sequence[float]) -> dict[Group, list[Array]]:
         """Return the coefficients that do not know a group, for every group and penalty."""
-        found: dict[bytes, list[Array]] = {}
         known = {group: self.known(group) for group in self.groups}
-        for rest in known.values():
-            if rest.tobytes() not in found:
-                found[rest.tobytes()] = list(self.solved(whitening, np.where(rest, weights, 0.0), penalties))
+        several = {rest.tobytes(): np.where(rest, weights, 0.0) for rest in known.values()}
+        found = {key: list(self.solved(rest, penalties)) for key, rest in several.items()}
         return {group: found[rest.tobytes()] for group, rest in known.items()}
 
 
@@ -323,7 +299,6 @@ class Readout:
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
     penalties: Array  # (n,)
-    folds: npt.NDArray[np.int64]  # (groups,)
     others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
 
     @classmethod
@@ -331,24 +306,21 @@ class Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = Whitening.of(design)
         moments = Moments.of(design, whitening)
-        weights, penalties = condition_weights(moments, whitening), design.settings.penalties
-        others = moments.without(whitening, weights, penalties)
-        errors = np.array(
-            [[moments.errors(c, np.array([i]))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
-        )
-        counted = (moments.power > 0)[
-            :, None
-        ]  # a state at zero throughout a group would ask for no estimate of it at all
+        weights, penalties = condition_weights(moments), design.settings.penalties
+        others = moments.without(weights, penalties)
+        left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
+        errors = np.array(left_out)
+        # A state at zero throughout a group would ask for no estimate of it at all.
+        counted = (moments.power > 0)[:, None]
         best = np.argmin(np.log(errors).mean(axis=0, where=counted | ~counted.any(axis=0)), axis=0)
         n = np.arange(errors.shape[2])
-        coefficients = np.array(list(moments.solved(whitening, weights, penalties)))[best, :, n].T
+        coefficients = np.array(list(moments.solved(weights, penalties)))[best, :, n].T
         return cls(
             design,
             whitening.directions @ coefficients * design.recordings.size,
             errors[:, best, n],
-            moments.errors(coefficients, np.arange(len(weights))),
+            moments.errors(coefficients),
             np.array(penalties)[best],
-            moments.of_groups("fold"),
             {g: whitening.directions @ np.array(each)[best, :, n].T for g, each in others.items()},
         )
 
@@ -359,6 +331,11 @@ class Readout:
         same = [(groups[key].fold, groups[key].part) == (first.fold, first.part) for key in recordings.keys]
         return first, recordings.only(same)
 
+    @property
+    def typical(self) -> Array:
+        """Typical left-out error of every state over its size, shape (n,)."""
+        return np.exp(np.log(self.left_out).mean(axis=0) / 2)
+
     def without(self, group: Group) -> Readout:
         """Return the readout that does not know a group."""
         return replace(self, coefficients=self.others[group] * self.design.recordings.size)
@@ -366,7 +343,8 @@ class Readout:
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
         log = np.log(self.left_out[:, list(states)]).mean(axis=1)
-        return np.array([log[self.folds == fold].mean() for fold in np.unique(self.folds)])
+        folds = np.array([group.fold for group in self.others])
+        return np.array([log[folds == fold].mean() for fold in np.unique(folds)])
 
     def episode_errors(self) -> Array:
         """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
@@ -388,14 +366,10 @@ def is_less(one: Array, other: Array, margin: float) -> bool:
     return bool(difference.mean() + margin * error < 0)
 
 
-def condition_weights(moments: Moments, whitening: Whitening) -> Array:
+def condition_weights(moments: Moments) -> Array:
     """Return weights of the groups: all alike within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
-    weights = np.ones(len(conditions))
-    if len(set(conditions)) == 1:
-        return weights
-    (first,) = moments.solved(whitening, weights, [ROUNDING])
-    errors = np.exp(np.log(moments.errors(first, np.arange(len(weights)))).mean(axis=1))
-    for condition in set(conditions):
-        weights[conditions == condition] = 1 / errors[conditions == condition].mean()
-    return weights
+    alike = conditions[:, None] == conditions
+    (first,) = moments.solved(np.ones(len(alike)), [ROUNDING])
+    errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
+    return alike.sum(axis=1) / (alike @ errors)

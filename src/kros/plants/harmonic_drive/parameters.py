@@ -25,7 +25,6 @@ COUNT_RAD = 2 * np.pi / (2**15 * GEAR_RATIO)  # of the encoder, whose counts are
 VELOCITY_POLE = float(np.exp(-2 * np.pi * 150.0 * SAMPLE_PERIOD_S))  # first-order filter at 150 Hz
 CURRENT_NOISE = 2e-3  # standard deviation, fraction of full scale
 SMOOTHING_VELOCITY = 0.02  # rad/s: width of the sign function of friction
-UNIT_STREAM, OUTLIER_STREAM = 1, 2  # first word of the spawn key
 
 # name: (nominal value, relative deviation at spread 1)
 NOMINAL: dict[str, tuple[float, float]] = {
@@ -111,24 +110,3 @@ class DriveParameters:
         fade = (1.0 / self.stribeck_velocity * velocity) ** 2 + 1.0
         torque = self.breakaway_torque / fade + self.coulomb_torque
         return torque * velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
-
-
-def draw_parameters(seed: int, n_units: int, spread: float, severity: float | None = None) -> DriveParameters:
-    """Draw the drives of a batch, in front of them one with loose fasteners where there is a severity."""
-    units = [_draw(seed, (UNIT_STREAM, k), spread) for k in range(n_units)]
-    if severity is not None:
-        bad = _draw(seed, (OUTLIER_STREAM, 0), spread)
-        factors = {name: np.exp(severity * factor) for name, factor in OUTLIER_LOG_FACTORS.items()}
-        units.insert(0, {name: value * factors.get(name, 1.0) for name, value in bad.items()})
-    names = [f.name for f in fields(DriveParameters)]
-    return DriveParameters(**{name: np.array([unit[name] for unit in units], dtype=float) for name in names})
-
-
-def _draw(seed: int, stream: tuple[int, int], spread: float) -> dict[str, Any]:
-    """Draw the parameters of one drive."""
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=stream))
-    shares = {name: np.exp(spread * deviation * rng.standard_normal()) for name, (_, deviation) in NOMINAL.items()}
-    values: dict[str, Any] = {name: nominal * shares[name] for name, (nominal, _) in NOMINAL.items()}
-    values["ripple"] = RIPPLE * np.exp(spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))
-    values["phase_rad"] = rng.uniform(0.0, 2 * np.pi, len(RIPPLE))
-    return values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,12 +12,24 @@ import numpy.typing as npt
 from ...core.errors import ConfigError, DataError
 from ...core.settings import member
 from ...data import prepare
-from ...data.population import OUTLIERS, Channel, EpisodeKey, Role, Unit
+from ...data.population import Channel, EpisodeKey, Role
 from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
-from ..batch import BatchSettings, SimulatedEpisodes, SimulatedPopulation
+from ..batch import OUTLIER_STREAM, BatchSettings, SimulatedEpisodes, SimulatedPopulation, by_unit
 from .dynamics import simulate
-from .parameters import CURRENT_NOISE, GAINS, GEAR_RATIO, SAMPLE_PERIOD_S, DriveParameters, Gains, Loop, draw_parameters
+from .parameters import (
+    CURRENT_NOISE,
+    GAINS,
+    GEAR_RATIO,
+    NOMINAL,
+    OUTLIER_LOG_FACTORS,
+    RIPPLE,
+    RIPPLE_DEVIATION,
+    SAMPLE_PERIOD_S,
+    DriveParameters,
+    Gains,
+    Loop,
+)
 from .reference import episode_reference
 
 Array = npt.NDArray[Any]
@@ -62,9 +74,7 @@ class Truth:
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything but the long signals, ready for JSON: one entry per unit."""
-        names = [f.name for f in fields(self.parameters)]
-        rows = enumerate(self.unit_ids)
-        units = {unit: {name: getattr(self.parameters, name)[row].tolist() for name in names} for row, unit in rows}
+        units = by_unit(self.unit_ids, self.parameters)
         return {"plant": "harmonic-drive", "loop": self.loop.value, "gains": asdict(self.gains), "units": units}
 
 
@@ -87,6 +97,9 @@ class HarmonicDrivePopulation(BatchSettings):
 
     plant: ClassVar[str] = "harmonic-drive"
     least_seconds: ClassVar[float] = 2.0
+    serial: ClassVar[tuple[int, int]] = (1001, 6)
+    outlier_stream: ClassVar[tuple[int, ...]] = (OUTLIER_STREAM, 0)
+    parameters, outlier_log_factors = NOMINAL, OUTLIER_LOG_FACTORS
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,16 +114,16 @@ class HarmonicDrivePopulation(BatchSettings):
 
         Raw episodes have a second at rest at the start and an offset of the measured position.
         """
-        units, conditions = self._units(), sorted(self.conditions)
-        severity = self.outlier_severity if self.outlier else None
-        parameters = draw_parameters(self.seed, self.n_units, self.spread, severity)
+        (units, values), conditions = self.units(), sorted(self.conditions)
+        parameters = DriveParameters(**values)
         keys = tuple(EpisodeKey(u.id, c, str(e)) for u in units for c in conditions for e in range(self.n_episodes))
         row, condition, episode = np.unravel_index(np.arange(len(keys)), (len(units), len(conditions), self.n_episodes))
         loaded = np.array([c == "load" for c in conditions], float)[condition]
-        targets, loop = self._targets(), Loop(self.loop)
-        signals = simulate(parameters.take(row), loaded, episode, (targets[0], targets[1]), GAINS[loop])
+        samples, loop = (round(self.seconds / SAMPLE_PERIOD_S) + 1, REST_SAMPLES, SAMPLE_PERIOD_S), Loop(self.loop)
+        inputs = [np.stack(episode_reference(self.seed, e, *samples)) for e in range(self.n_episodes)]
+        position, velocity = np.stack(inputs, axis=1)
+        signals = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
         self._disturb(signals.states, keys)
-        inputs = [np.ascontiguousarray(targets[:, e]) for e in range(self.n_episodes)]
         parts = {key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)}
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
@@ -119,14 +132,12 @@ class HarmonicDrivePopulation(BatchSettings):
         truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, torque)
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
-    def _units(self) -> tuple[Unit, ...]:
-        units = tuple(Unit(f"{1001 + k:06d}", "population") for k in range(self.n_units))
-        return (Unit("000000", OUTLIERS), *units) if self.outlier else units
-
-    def _targets(self) -> Array:
-        """Target position and velocity of every episode, shape (2, n_episodes, n_samples)."""
-        samples = (round(self.seconds / SAMPLE_PERIOD_S) + 1, REST_SAMPLES, SAMPLE_PERIOD_S)
-        return np.stack([np.stack(episode_reference(self.seed, e, *samples)) for e in range(self.n_episodes)], axis=1)
+    def draw(self, rng: np.random.Generator) -> dict[str, Any]:
+        """Draw the parameters of one drive, those of its ripple last."""
+        ripple = super().draw(rng) | {
+            "ripple": RIPPLE * np.exp(self.spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))
+        }
+        return ripple | {"phase_rad": rng.uniform(0.0, 2 * np.pi, len(RIPPLE))}
 
     def _disturb(self, states: Array, keys: tuple[EpisodeKey, ...]) -> None:
         """Add what the recording adds: an offset of the position in each episode, noise on the current."""

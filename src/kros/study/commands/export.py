@@ -85,7 +85,7 @@ def exactness(folder: Path, observer: Observer, config: StudyConfig, store: Stor
     y = arriving.measurements(observer.measured)
     parameters = observer.own(batch.parameters)
     wanted = run_observer(observer, y, batch.inputs, parameters)[1:, 0, : len(observer.recorded)]
-    measured = [observer.lifting.states[i] for i in observer.measured]
+    measured = observer.outputs
     of_y, of_u, of_x = (recorded_factors(observer, n) for n in (measured, observer.inputs, observer.recorded))
     values = {name: float(np.ravel(value)[0]) for name, value in parameters.items()}
     estimates, _ = compiled.run(y[:, 0] / of_y, batch.inputs[:, 0] / of_u, values)

@@ -74,7 +74,7 @@ def hidden_states(observer: Observer) -> tuple[str, ...]:
 def check_channels(population: Population, observer: Observer, *, hidden: bool = True) -> None:
     """Refuse other channels, units of measure or sampling periods than those of the run, perhaps of hidden states."""
     expected, there = (observer.recorded, observer.inputs), (population.states, population.inputs)
-    needed = (*(observer.lifting.states[i] for i in observer.measured), *observer.inputs)
+    needed = (*observer.outputs, *observer.inputs)
     names = [*population.states, *population.inputs]
     if not hidden and (missing := [name for name in needed if name not in names]):
         absent = f"{', '.join(missing)} is missing, which the observer reads; there are {', '.join(names)}"

@@ -113,6 +113,7 @@ def identify_estimator(
     facts = {
         "channels": family,
         "filters": len(filters.A),
+        "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
         "left_out_worst_percent": by_state(100 * worst),

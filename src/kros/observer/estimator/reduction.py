@@ -32,6 +32,7 @@ class Filters:
     C: Array  # (n, r)
     D: Array  # (n, channels)
     S: Array  # (r, channels)
+    singular_values: Array  # all of them, relative to the errors of the estimates
 
     def first(self, order: int) -> Filters:
         """Return the first states alone."""
@@ -75,7 +76,7 @@ def reduced(readout: Readout, order: int | None = None) -> Filters:
     _, sigma, V = np.linalg.svd((X / size * np.sqrt(w)[:, None]) @ L.T, full_matrices=False)
     scale = np.maximum(sigma, EPS * sigma[0])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
-    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S)
+    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
     if order is not None:
         return whole.first(order)
     signals = design.signals(some=_EPISODES, length=round(10 * max([*design.bank.lags, design.bank.taps[-1]])))

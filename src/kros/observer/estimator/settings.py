@@ -21,8 +21,8 @@ class EstimatorSettings(Settings):
 
     unbounded: dict[str, tuple[str, ...]] = Field(
         {},
-        description="measured states that may go on for ever, such as the position of a spindle, with the inputs that go "
-        "on with them, such as its reference; the estimator sees their changes and distances alone",
+        description="measured states that may go on for ever, such as the position of a spindle, with the inputs that "
+        "go on with them, such as its reference; the estimator sees their changes and distances alone",
     )
     dense: int = Field(32, ge=1, description="delays of every linear channel that are taken one by one, in samples")
     longest: int = Field(

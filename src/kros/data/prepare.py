@@ -31,6 +31,7 @@ from .recording import (
     check_even,
     check_period,
     check_structure,
+    checked_blocks,
     estimate_period,
 )
 from .steps import STEPS, Signals, Step
@@ -60,10 +61,10 @@ class PreparedSource:
         return recording.values
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
-        """Return one prepared episode in blocks: of kros's own files, which were checked, or of what is read whole."""
+        """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
         parts = None if self.steps else self.recordings.blocks(key, rows)
         if parts is not None:
-            return (part.values for part in parts)
+            return checked_blocks((part.values for part in parts), key, self.channels, gaps=self.gaps)
         values = self(key)
         return (values[k : k + rows] for k in range(0, len(values), rows))
 

@@ -169,26 +169,39 @@ class NonFiniteError(DataError):
 
 def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
     """Check one episode's samples: shape, length, numbers, and that no state stands still while others move."""
-    if values.ndim != 2 or values.shape[1] != len(channels):
-        declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
-        raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
-    if len(values) < CHECK.samples:
-        need = f"at least {CHECK.samples} samples are needed, found {len(values)}"
+    for _ in checked_blocks([values], key, channels, gaps=gaps):
+        pass
+
+
+def checked_blocks(
+    blocks: Iterable[Array], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False
+) -> Iterator[Array]:
+    """Give the blocks of one episode, none of them empty, on, and check them as `check_episode` does."""
+    count, first, resting = 0, np.empty(0), np.ones(len(channels), dtype=bool)
+    for values in blocks:
+        if values.ndim != 2 or values.shape[1] != len(channels):
+            declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
+            raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
+        if not gaps and count + len(values) >= CHECK.samples and not usable(values).all():
+            check_finite(values, key, channels, first=count)
+        first = first if count else values[:1].ravel()
+        resting &= [r and len(values) > 0 and is_constant(values[:, i], first[i]) for i, r in enumerate(resting)]
+        count += len(values)
+        yield values
+    if count < CHECK.samples:
+        need = f"at least {CHECK.samples} samples are needed, found {count}"
         raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
-    if not gaps and not usable(values).all():
-        check_finite(values, key, channels)
-    resting = [is_constant(column) for column in values.T]
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and resting[i]]
     moving = [c.name for i, c in enumerate(channels) if still and not resting[i]]
     if moving:
-        stays = f"state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples"
+        stays = f"state {channels[still[0]].name!r} stays at {first[still[0]]:g} in all {count} samples"
         reason = f"while {', '.join(map(repr, moving))} move, so its sensor is stuck or the column is wrong"
         raise DataError(f"{title(key)}: {stays} {reason}; leave the episode out, or the channel.")
 
 
-def is_constant(column: Array) -> bool:
+def is_constant(column: Array, first: float | None = None) -> bool:
     """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
-    first = column[0]
+    first = column[0] if first is None else first
     if not np.isfinite(first):
         return False
     room = CHECK.constant * abs(first)
@@ -240,7 +253,7 @@ class GroupWatch:
         for key, ((low, middle, high), _, samples, values) in self._signals.items():
             usual = np.quantile([of[1] for of in self._signals.values()], 0.5, axis=0, method="lower")
             size = np.max([high - low, np.abs(low), np.abs(high), usual], axis=0)
-            for i in map(int, np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))):
+            for i in np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0)):
                 actual = f"{values[i]:g} at sample {samples[i]}"
                 most = f"98 % of its samples are from {low[i]:g} to {high[i]:g}"
                 yield key, f"channel {self._channels[i].name!r} is {actual}, and {most}"

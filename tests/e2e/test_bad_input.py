@@ -142,7 +142,7 @@ def test_out_of_memory_is_not_taken_for_a_damaged_file(kros, tmp_path, raw, monk
         write_parquet(read(raw), source)
         monkeypatch.setattr("pyarrow.parquet.ParquetFile.read_row_group", fail)
     else:
-        monkeypatch.setattr("pyarrow.csv.read_csv", fail)
+        monkeypatch.setattr("pyarrow.csv.open_csv", fail)
     (tmp_path / "study.toml").write_text(f'[data]\nsource = "{source}"\nreader = "{reader}"\n')
     result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--workers", 1, "--until", "read")
     assert result.exit_code == code, result.stderr

@@ -9,6 +9,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import EpisodeKey, Population
+from kros.data.readers import tables
 from kros.data.readers.csv_folder import read_csv_folder
 
 N = 50
@@ -240,3 +241,22 @@ def test_milliseconds_since_1970_lose_nothing(tmp_path: Path) -> None:
     rows = [f"{1716000000000 + 2 * k},{k},{k * k}" for k in range(9)]
     (tmp_path / "a.csv").write_text("\n".join(["t,pos,volt", *rows]))
     assert read_csv_folder(tmp_path, mapping(files="a", time_scale=1e-3)).sample_period_s == 0.002
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.05])
+def test_a_long_file_is_read_in_blocks_as_it_is_read_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gap: float
+) -> None:
+    monkeypatch.setattr(tables, "BLOCK", 1 << 12)
+    values = np.column_stack([np.arange(2000) * 0.01, np.random.default_rng(0).standard_normal((2000, 2))])
+    values[1500:, 0] += gap
+    write(tmp_path / "a_1.csv", values)
+    population = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>a)_(?P<episode>\d)", sample_period_s=None))
+    (key,) = population.episodes
+    if gap:
+        with pytest.raises(DataError, match="uneven time"):
+            list(population.blocks(key, 300))
+        return
+    blocks = list(population.blocks(key, 300))
+    assert len(blocks) > 4
+    np.testing.assert_array_equal(np.concatenate(blocks), population.read(key))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,8 @@ from .recording import (
 )
 from .steps import STEPS, Signals, Step
 
+HEAD = 100_000  # samples whose median step is the period
+
 
 @dataclass(frozen=True, eq=False)
 class PreparedSource:
@@ -50,23 +52,41 @@ class PreparedSource:
 
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
-        recording, signals = self.recordings(key), Signals(self.channels, self.period_s)
+        recording = self.recordings(key)
+        self._check_time(recording)
+        values, channels = self._prepared(recording)
+        check_episode(values, key, channels, gaps=self.gaps)
+        return values
+
+    def _check_time(self, recording: Recording) -> None:
+        """Refuse uneven time, unless a step makes it even."""
         if not any(step.makes_even for step in self.steps):
-            file = self.recordings.file(self.recordings.places[key])
+            file = self.recordings.file(self.recordings.places[recording.key])
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
+
+    def _prepared(self, recording: Recording) -> tuple[npt.NDArray[np.float64], tuple[Channel, ...]]:
+        """Return what steps make of an episode, or of a part of it, and the channels."""
+        signals = Signals(self.channels, self.period_s)
         for step in self.steps:
             recording = step.apply(recording, signals.channels, signals.period_s)
             signals = step.describe(signals)
-        check_episode(recording.values, key, signals.channels, gaps=self.gaps)
-        return recording.values
+        return recording.values, signals.channels
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
         """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
-        parts = None if self.steps else self.recordings.blocks(key, rows)
-        if parts is not None:
-            return checked_blocks((part.values for part in parts), key, self.channels, gaps=self.gaps)
+        if all(step.samplewise for step in self.steps):
+            return checked_blocks(self._in_turn(self.recordings.blocks(key, rows)), key, self.channels, gaps=self.gaps)
         values = self(key)
         return (values[k : k + rows] for k in range(0, len(values), rows))
+
+    def _in_turn(self, blocks: Iterable[Recording]) -> Iterator[npt.NDArray[np.float64]]:
+        """Yield blocks of an episode after their steps; time is checked from the sample before on."""
+        end = np.empty(0)
+        for block in blocks:
+            if block.time_s is not None:
+                self._check_time(replace(block, time_s=np.append(end, block.time_s)))
+                end = block.time_s[-1:]
+            yield self._prepared(block)[0]
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> PreparedSource:
         """Return the same for fewer episodes."""
@@ -92,7 +112,7 @@ def assemble(
     facts = {unit.id: unit for unit in units}
     known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
     if sample_period_s is None:
-        sample_period_s = estimate_period(recordings(episodes[0]))
+        sample_period_s = estimate_period(next(recordings.blocks(episodes[0], HEAD)))
     period = check_period(sample_period_s, "Population")
     source = PreparedSource(recordings, channels, period, episodes[0])
     about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
@@ -167,6 +187,7 @@ class _Divide(Step):
     """Divide columns by sizes."""
 
     sizes: tuple[float, ...]
+    samplewise: ClassVar[bool] = True
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the recording in the sizes."""

@@ -58,6 +58,12 @@ class Recording:
         time = None if self.time_s is None else self.time_s[start:stop]
         return replace(self, values=self.values[start:stop], time_s=time)
 
+    def ended(self) -> Recording:
+        """Return the same without a last sample that repeats the stamp before it, as stopped recorders write."""
+        time = self.time_s
+        repeated = time is not None and len(time) > 1 and time[-1] == time[-2]
+        return self.cut(0, len(self.values) - 1) if repeated else self
+
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
@@ -70,17 +76,15 @@ class Recordings:
         raise NotImplementedError
 
     def __call__(self, key: EpisodeKey) -> Recording:
-        """Return one episode, without a last sample that repeats the stamp before it, as stopped recorders write."""
+        """Return one episode."""
         if key not in self.places:
             others = f"this source has {len(self.places)} other episodes"
             raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
-        recording = self.read(key, self.places[key])
-        stamps = () if recording.time_s is None else recording.time_s[-2:]
-        return recording if len(set(stamps)) == len(stamps) else recording.cut(0, -1)
+        return self.read(key, self.places[key]).ended()
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording] | None:
-        """Return one episode in blocks of at most `rows` samples where the format can."""
-        return None
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
+        """Yield one episode in blocks of about `rows` samples where the format can, else whole."""
+        yield self(key)
 
     def file(self, place: Any) -> Path | None:
         """Return the one file that an episode is in, where it is in one."""

@@ -76,6 +76,7 @@ class Step:
 
     step: ClassVar[str] = ""
     makes_even: ClassVar[bool] = False
+    samplewise: ClassVar[bool] = False  # whether every sample is prepared by itself
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     @property
@@ -122,6 +123,7 @@ class Scale(Step):
     factor: float
     unit: str | None = None
     step: ClassVar[str] = "scale"
+    samplewise: ClassVar[bool] = True
 
     def describe(self, signals: Signals) -> Signals:
         """Return the signals with channels multiplied and their new unit of measure."""

@@ -22,7 +22,7 @@ from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Rol
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import Scale, Step
-from .tables import TIMESTAMP_SCALE, Dialect, file_fields, read_table
+from .tables import TIMESTAMP_SCALE, Dialect, file_fields, read_blocks
 
 Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
@@ -218,14 +218,34 @@ class CsvRecordings(Recordings):
 
     def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
         """Return one episode as recorded."""
-        values = read_table(Path(place.path), place.fields, place.wanted, self.dialect, self.timestamp)
-        i, n = place.piece
-        values = values[i * len(values) // n : (i + 1) * len(values) // n]
+        (values,), (i, n) = self._values(place, np.inf), place.piece
+        part = values[i * len(values) // n : (i + 1) * len(values) // n]
+        return self._recording(key, part, part[:1])
+
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
+        """Yield one episode in blocks, unless it is a piece of a file."""
+        place = self.places[key]
+        if place.piece[1] > 1:
+            yield self(key)
+            return
+        first, waiting = np.empty(0), list[Recording]()
+        for values in self._values(place, rows):
+            yield from waiting
+            first = first if first.size else values[:1]
+            waiting = [self._recording(key, values, first)]
+        yield waiting[0].ended()
+
+    def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
+        """Yield the columns of a file in blocks."""
+        return read_blocks(Path(place.path), place.fields, place.wanted, self.dialect, self.timestamp, rows)
+
+    def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
+        """Return samples with their time, the first column if there is one, since the `first` of an episode."""
         if self.time_scale is None:
             return Recording(key, np.ascontiguousarray(values))
-        time = np.where(usable(values[:, 0]), values[:, 0], np.nan)
-        since = time - time[:1]  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
         scale = self.time_scale if self.timestamp is None else TIMESTAMP_SCALE
+        time, start = (np.where(usable(t), t, np.nan) for t in (values[:, 0], first[:, 0]))
+        since = time - start  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
         return Recording(key, np.ascontiguousarray(values[:, 1:]), since * scale)
 
 

@@ -92,13 +92,37 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-def read_table(
-    path: Path, fields: Sequence[str], wanted: Sequence[int], dialect: Dialect, timestamp: str | None = None
-) -> Array:
-    """Return some columns of a table by their positions, shape (n_rows, len(wanted)).
+def read_table(path: Path, fields: Sequence[str], wanted: Sequence[int], dialect: Dialect) -> Array:
+    """Return some columns of a table by their positions, shape (n_rows, len(wanted))."""
+    (values,) = read_blocks(path, fields, wanted, dialect)
+    return values
+
+
+def read_blocks(
+    path: Path,
+    fields: Sequence[str],
+    wanted: Sequence[int],
+    dialect: Dialect,
+    timestamp: str | None = None,
+    rows: float = np.inf,
+) -> Iterator[Array]:
+    """Yield some columns of a table in blocks of at least `rows`, the last one apart, shape (n, len(wanted)).
 
     With the order of a date in `timestamp` the first one holds timestamps, which become microseconds.
     """
+    waiting = [np.empty((0, len(wanted)))]
+    for part in _parts(path, fields, wanted, dialect, timestamp):
+        if len(part) > 1 and sum(map(len, waiting)) >= rows:
+            yield np.concatenate(waiting)
+            waiting = []
+        waiting.append(part)
+    yield np.concatenate(waiting)
+
+
+def _parts(
+    path: Path, fields: Sequence[str], wanted: Sequence[int], dialect: Dialect, timestamp: str | None
+) -> Iterator[Array]:
+    """Yield columns of a table as Arrow cuts it."""
     import pyarrow as pa
     from pyarrow import csv as arrow
 
@@ -116,10 +140,10 @@ def read_table(
         ),
     )
     with _explained(path, fields, dialect), opened(path, dialect.encoding) as file:
-        table = arrow.read_csv(pa.PythonFile(file, mode="r"), *options)
-        columns = [table.column(names[i]) for i in wanted]
-        first = [] if timestamp is None else [microseconds(columns.pop(0), timestamp)]
-        return np.column_stack([*first, *map(to_numpy, columns)])
+        for batch in arrow.open_csv(pa.PythonFile(file, mode="r"), *options):
+            columns = [batch.column(names[i]) for i in wanted]
+            first = [] if timestamp is None else [microseconds(columns.pop(0), timestamp)]
+            yield np.column_stack([*first, *map(to_numpy, columns)])
 
 
 @contextmanager

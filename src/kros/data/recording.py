@@ -257,7 +257,7 @@ class GroupWatch:
         for key, ((low, middle, high), _, samples, values) in self._signals.items():
             usual = np.quantile([of[1] for of in self._signals.values()], 0.5, axis=0, method="lower")
             size = np.max([high - low, np.abs(low), np.abs(high), usual], axis=0)
-            for i in np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0)):
+            for i in map(int, np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))):
                 actual = f"{values[i]:g} at sample {samples[i]}"
                 most = f"98 % of its samples are from {low[i]:g} to {high[i]:g}"
                 yield key, f"channel {self._channels[i].name!r} is {actual}, and {most}"

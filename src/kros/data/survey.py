@@ -32,10 +32,9 @@ Array = npt.NDArray[np.float64]
 
 def period_alerts(period_s: float) -> tuple[str, ...]:
     """Return what speaks against a sampling period: a time in ms or us that is taken for seconds."""
-    if CHECK.shortest_s < period_s < CHECK.longest_s:
-        return ()
     unusual = f"The sampling period of {period_s:g} s is unusual: check the unit of the column of time (time_scale)"
-    return (f"{unusual} and sample_period_s, on which every frequency depends.",)
+    alert = f"{unusual} and sample_period_s, on which every frequency depends."
+    return () if CHECK.shortest_s < period_s < CHECK.longest_s else (alert,)
 
 
 log = logging.getLogger(__name__)
@@ -171,24 +170,22 @@ def survey(
 
     groups = list((work or Work()).recall("read", _read_group, tasks, marks, _GroupFacts, usable))
     retained = _retained(population, groups, folder)
-    episodes = [e for group in groups for e in group.episodes if e.key.unit not in set(chosen.reserve)]
-    resolution = {m: min(g.resolution[m] for g in groups) for m in retained.measured}
-    facts = replace(_facts(population, retained, episodes, chosen), resolution=resolution)
+    facts = _facts(population, retained, groups, chosen)
     for alert in facts.alerts:
         log.warning("%s", alert)
     return retained, facts
 
 
 def _facts(
-    population: Population, retained: Population, episodes: Sequence[_EpisodeFacts], options: SurveyOptions
+    population: Population, retained: Population, read: Sequence[_GroupFacts], options: SurveyOptions
 ) -> RecordingFacts:
     """Return the facts of all episodes that take part."""
-    left, part = set(retained.episodes), [u for u in retained.unit_ids if u not in set(options.reserve)]
-    splits = split_episodes(retained.select(part), options.test)
+    left, part = set(retained.episodes), [u for u in retained.unit_ids if u not in options.reserve]
+    splits, groups = split_episodes(retained.select(part), options.test), {u: retained.unit(u).group for u in part}
+    episodes = [e for group in read for e in group.episodes if e.key.unit in groups]
     if short := [f"{title(e.key)} has {e.n_samples}" for e in episodes if e.n_samples < options.fewest]:
         needs = f"every episode needs at least {options.fewest} samples after preparation"
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
-    groups = {unit: retained.unit(unit).group for unit in part}
     pooled = [e for e in episodes if groups[e.key.unit] != OUTLIERS]
     ranges = np.ptp(np.concatenate([e.reach for e in pooled]), axis=0) if pooled else np.zeros(0)
     limits = {name: found_limit([e.ends[name] for e in pooled], ranges) for name in (pooled[0].ends if pooled else ())}
@@ -197,7 +194,7 @@ def _facts(
         groups=groups,
         train=tuple(k for s in splits.values() for k in s.train),
         test=tuple(k for s in splits.values() for k in s.test),
-        resolution={},
+        resolution={m: min(g.resolution[m] for g in read) for m in retained.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
         alerts=period_alerts(retained.sample_period_s),
         reserve=tuple(options.reserve),

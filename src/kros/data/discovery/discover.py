@@ -21,7 +21,7 @@ from ...core.files import did_you_mean
 from ...core.work import Work
 from ..population import EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, csv_files, read_csv_folder
-from ..readers.tables import Dialect, file_fields, read_table
+from ..readers.tables import Dialect, file_fields, read_blocks
 from ..recording import CHECK, some, usable
 from ..steps import GAP
 from .dialect import TableHead, look_at
@@ -175,8 +175,8 @@ def _time(
 
 def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
     """Read the numeric columns of a file, shape (n_columns, n_rows), NaN where a number cannot be used."""
-    values = read_table(path, head.fields, columns, head.dialect).T
-    return np.where(usable(values), values, np.nan)
+    (values,) = read_blocks(path, head.fields, columns, head.dialect)
+    return np.where(usable(values), values, np.nan).T
 
 
 def _channel(column: TableColumn) -> dict[str, Any]:

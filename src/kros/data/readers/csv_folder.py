@@ -263,7 +263,10 @@ def read_csv_folder(
         named = {name: text for name, text in match.groupdict().items() if text}
         for unit in chosen.units:
             place, group = _place(path, fields, chosen, unit), named.get("group", "")
-            for i, key in enumerate(_keys(named, chosen.pieces, unit.suffix)):
+            name, condition = named.get("unit", DEFAULT_UNIT) + unit.suffix, named.get("condition", DEFAULT_CONDITION)
+            for i in range(chosen.pieces):
+                ending = f".{i + 1}" if chosen.pieces > 1 else ""
+                key = EpisodeKey(name, condition, named.get("episode", DEFAULT_EPISODE) + ending)
                 if key in places:
                     twice = f"{key} is in {places[key].path} and in {path}"
                     raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
@@ -282,14 +285,6 @@ def read_csv_folder(
     units = [Unit(unit, group) for unit, group in groups.items()]
     facts = (chosen.channels, units, chosen.sample_period_s, chosen.metadata)
     return assemble(recordings, *facts, steps=chosen.steps, scaling=chosen.scaling)
-
-
-def _keys(named: Mapping[str, str], pieces: int, suffix: str) -> list[EpisodeKey]:
-    """Return the episodes of one unit in a file, by what its path says."""
-    unit, condition = named.get("unit", DEFAULT_UNIT) + suffix, named.get("condition", DEFAULT_CONDITION)
-    episode = named.get("episode", DEFAULT_EPISODE)
-    endings = [f".{i + 1}" for i in range(pieces)] if pieces > 1 else [""]
-    return [EpisodeKey(unit, condition, f"{episode}{ending}") for ending in endings]
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:

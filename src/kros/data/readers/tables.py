@@ -92,12 +92,6 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-def read_table(path: Path, fields: Sequence[str], wanted: Sequence[int], dialect: Dialect) -> Array:
-    """Return some columns of a table by their positions, shape (n_rows, len(wanted))."""
-    (values,) = read_blocks(path, fields, wanted, dialect)
-    return values
-
-
 def read_blocks(
     path: Path,
     fields: Sequence[str],

@@ -88,7 +88,7 @@ def junit_text(rows: Sequence[dict[str, Any]]) -> str:
     """Return JUnit XML with a test case for every unit; UNDECIDED is an error, so that a build does not pass on it."""
     units, tags = by_unit(rows), {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}
     counts = {f"{tag}s": str(sum(v is verdict for v, _ in units.values())) for verdict, tag in tags.items()}
-    suite = ElementTree.Element("testsuite", name="kros check", tests=str(len(units)), **counts)
+    suite = ElementTree.Element("testsuite", {"name": "kros check", "tests": str(len(units)), **counts})
     for unit, (verdict, reasons) in units.items():
         case = ElementTree.SubElement(suite, "testcase", classname="kros.check", name=_printable(unit))
         if verdict in tags:

@@ -151,7 +151,7 @@ def against_python(observer: Observer, track: str | None, data: HeldOut, given: 
     """Yield one line: differences of both precisions without and with faults, status, and what single precision loses."""
     own, steps, seed = observer.own(data.parameters), 0, 0
     clean, apart, unlike, loss = {}, {"double": 0.0, "float": 0.0}, {"double": 0, "float": 0}, np.zeros(1)
-    met = UNCERTIFIED | (LIMIT if observer.runtime.lower is not None or observer.runtime.correction is not None else 0)
+    met = UNCERTIFIED | (LIMIT if observer.runtime.lower is not None else 0)
     while steps < given.steps:
         y, u = (data.y, data.u) if not steps else faulty(data, seed)
         wanted, bits = in_python(observer, y, u, own, track), screened(observer, y, u).status
@@ -228,14 +228,9 @@ def in_steps(observer: Observer, track: str | None, y: np.ndarray, u: np.ndarray
 
 
 def least_input(observer: Observer) -> np.ndarray:
-    """Return which inputs are references of the measured state, and by what factor."""
-    least = np.zeros(len(observer.inputs))
-    for j, _, factor in Source.of(observer, "observer", "double").realised.less:
-        least[j] = factor
-    if not least.any():  # the one that shares its name
-        name = observer.lifting.states[observer.measured[0]]
-        least = np.array([float(name in own) for own in observer.inputs])
-    return least
+    """Return which inputs are references of the measured state: those that share its name."""
+    name = observer.lifting.states[observer.measured[0]]
+    return np.array([float(name in own) for own in observer.inputs])
 
 
 def extended(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict) -> np.ndarray:

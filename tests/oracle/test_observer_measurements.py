@@ -65,8 +65,12 @@ def test_gains_are_what_an_error_of_the_measurement_costs(sizes):
         assert gains["bounded"][state] == pytest.approx(worst * size, rel=1e-5)
 
 
-def test_an_observer_that_forgets_nothing_has_no_gains():
-    assert sensor_gains(observer(L=np.array([[0.0], [1.0]])), {"x": 1.0, "v": 1.0}) == {}
+def test_an_observer_that_forgets_nothing_or_too_slowly_has_no_gains():
+    sizes = {"x": 1.0, "v": 1.0}
+    assert sensor_gains(observer(L=np.array([[0.0], [1.0]])), sizes) == {}
+    slow = replace(observer(L=np.array([[0.0], [0.1]])), A=np.diag([1 - 1e-7, 0.9]))
+    assert sensor_gains(slow, sizes) == {}
+    assert sensor_gains(replace(slow, A=np.diag([1 - 1e-3, 0.9])), sizes)
 
 
 def test_losing_everything_is_the_open_loop():

@@ -129,11 +129,8 @@ def blended_errors(
 ) -> Array:
     """Return log squared errors (c, batch, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
     count, age = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1]))
-    offset, squares = (
-        np.repeat((filtered - from_inputs)[:1], len(half), axis=0),
-        np.zeros((len(half), *states.shape[1:])),
-    )
-    x, level = filtered[0] + 0 * offset, 0 * offset
+    offset = np.repeat((filtered - from_inputs)[:1], len(half), axis=0)
+    x, level, squares = offset + from_inputs[0], *np.zeros((2, *offset.shape))
     for k, lost in enumerate(missing[:-1]):
         count = np.where(lost, count + 1, 0.0)
         age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)

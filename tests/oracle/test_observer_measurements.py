@@ -1,5 +1,7 @@
 """Wrong and lost measurements: what a linear observer makes of them has an answer on paper."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 

@@ -1,7 +1,6 @@
 """What is written and read: arrays in an .npz (no pickle), the rest in JSON, a schema version and a checksum of both.
 
-Files appear whole or not at all. What was changed since is not read; a JSON file that was edited on purpose is accepted
-without its key ``checksum``.
+Files appear whole or not at all, and are not read once changed. An edited JSON file without ``checksum`` is accepted.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import struct
 import tokenize
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache, wraps
@@ -226,9 +226,10 @@ def united(kind: Any, content: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
-    """Return what checks one value of a type."""
+    """Return what checks one value of a type, built in a thread: an interrupt would be lost or changed inside it."""
     one: Any = GenericAlias(tuple, (kind,))
-    return TypeAdapter(one, config=ConfigDict(arbitrary_types_allowed=True))
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(TypeAdapter[Any], one, config=ConfigDict(arbitrary_types_allowed=True)).result()
 
 
 def digest_of(*content: object) -> str:

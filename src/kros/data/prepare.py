@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
-from ..core.artifacts import digest_of
+from ..core.artifacts import digest_of, united
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened, stamp_of
 from .population import (
@@ -174,10 +174,10 @@ def _parse_step(table: Mapping[str, Any], where: str) -> Step:
     if not isinstance(name, str) or name not in STEPS:
         raise ConfigError(f"{where}: step should be one of {list(STEPS)}, found {name!r}; correct it.")
     try:
-        return TypeAdapter(STEPS[name]).validate_python({key: v for key, v in table.items() if key != "step"})
+        return united(STEPS[name], {key: v for key, v in table.items() if key != "step"}, {})
     except ValidationError as error:
         problem, known = error.errors()[0], [f.name for f in fields(STEPS[name])]
-        key, actual = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
+        key, actual = ".".join(map(str, problem["loc"][1:])), shortened(repr(problem["input"]))
         text = f"{key}: {problem['msg'].lower()}, found {actual}"
         raise ConfigError(f"{where} (step {name!r}): {text}; the keys are {', '.join(known)}.") from error
 

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import TypeAdapter
 
-from ..core.artifacts import file_digest, load_artifact, loader
+from ..core.artifacts import file_digest, load_artifact, loader, united
 from ..core.errors import DataError
 from ..core.files import is_file, link_or_copy
 from ..core.work import Work
@@ -93,7 +92,7 @@ class RecordingFacts:
         content, _ = load_artifact(folder, "facts")
         parts = {part: [EpisodeKey(*row) for row in content[part]] for part in _PARTS}
         pairs = [pair for part in _PARTS for pair in zip(parts[part], content["digests"][part], strict=True)]
-        return TypeAdapter(cls).validate_python({**content, **parts, "digests": dict(pairs)})
+        return united(cls, {**content, **parts, "digests": dict(pairs)}, {})
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,8 @@ from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import TypeAdapter
 
-from ...core.artifacts import load_artifact, save_artifact
+from ...core.artifacts import load_artifact, save_artifact, united
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
 from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
@@ -144,7 +143,7 @@ def read_parquet(folder: Path | str) -> Population:
     folder = Path(folder)
     content, _ = load_artifact(folder, INDEX)
     try:
-        index = TypeAdapter(_Index).validate_python(content)
+        index = united(_Index, content, {})
         places = _places(index.groups)
     except ValueError as error:
         what = f"Reading {folder / 'population.json'}: not as kros writes it"

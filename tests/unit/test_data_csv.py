@@ -176,7 +176,7 @@ def test_another_rate(folder: Path) -> None:
         ({"file": "x"}, r"file: unknown key; did you mean 'files'\? known are files, channel, time"),
         (
             {"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]},
-            r"channel\.0\.measurd: unknown key; did you mean 'measured'\? .* scale, of\.",
+            r"channel\.0\.measurd: unknown key; did you mean 'measured'\? .* scale, offset, of\.",
         ),
         (
             {"channel": [{"name": "x", "role": "output", "column": "pos"}]},

@@ -12,7 +12,8 @@ from kros.core.errors import DataError
 from kros.data.discovery.dialect import look_at
 from kros.data.discovery.discover import discover
 from kros.data.discovery.filenames import infer_names
-from kros.data.discovery.roles import identifier, kind_of, split_header, time_scale
+from kros.data.discovery.roles import TableColumn, identifier, kind_of, time_scale
+from kros.data.measures import split_header
 
 UNITS, EPISODES = range(1, 4), range(1, 4)
 
@@ -152,8 +153,8 @@ def test_names_of_channels_may_stand_in_formulas():
 
 
 def test_scale_of_time():
-    assert time_scale("ms", 1.0)[0] == 1e-3
-    assert [time_scale("", step)[0] for step in (0.001, 1.0, 2000.0, 1e6)] == [1.0, 1e-3, 1e-6, 1e-9]
+    assert time_scale(TableColumn("t [ms]", "t", "s", 1e-3), 1.0)[0] == 1e-3
+    assert [time_scale(TableColumn("t", "t"), step)[0] for step in (0.001, 1.0, 2000.0, 1e6)] == [1.0, 1e-3, 1e-6, 1e-9]
 
 
 def test_lines_before_the_numbers(tmp_path: Path):

@@ -117,11 +117,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Scale(Step):
-    """Multiply channels by a factor; `unit` names the new unit of measure."""
+    """Multiply channels by a factor and add an offset; `unit` names the new unit of measure."""
 
     channels: tuple[str, ...]
     factor: float
     unit: str | None = None
+    offset: float = 0.0
     step: ClassVar[str] = "scale"
     samplewise: ClassVar[bool] = True
 
@@ -130,7 +131,9 @@ class Scale(Step):
         self._require(0 < abs(self.factor) < math.inf, f"a finite factor other than zero, found {self.factor}")
         signals = super().describe(signals)
         for name in self.channels:
-            signals = signals.scaled(name, factor=scaling_of(signals.scaling, name).factor * self.factor)
+            before = scaling_of(signals.scaling, name)
+            added = ", ".join(filter(None, [before.offset, f"{self.offset:g}" if self.offset else ""]))
+            signals = signals.scaled(name, factor=before.factor * self.factor, offset=added)
         units = {} if self.unit is None else dict.fromkeys(self.channels, self.unit)
         channels = (replace(c, unit=units.get(c.name, c.unit)) for c in signals.channels)
         return replace(signals, channels=tuple(channels))
@@ -139,7 +142,8 @@ class Scale(Step):
         """Return the recording with some columns multiplied."""
         values = recording.values.copy()
         with np.errstate(over="ignore"):  # infinity is refused by the checks, with its place
-            values[:, self.columns(self.channels, channels)] *= self.factor
+            columns = self.columns(self.channels, channels)
+            values[:, columns] = values[:, columns] * self.factor + self.offset
         return replace(recording, values=values)
 
 

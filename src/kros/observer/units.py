@@ -18,7 +18,7 @@ from ..core.errors import DataError
 from ..core.files import shortened
 from ..core.lti import StateSpace
 from ..core.rounding import ROUNDING, TINY
-from ..data.discovery.roles import unit_of_factor
+from ..data.measures import unit_of_factor
 from ..synthesis.result import Injection
 from .data import ObserverData
 from .sensor import in_units

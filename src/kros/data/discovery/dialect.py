@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import DataError
-from ..readers.tables import ABSENT, ORDERS, Dialect, cells_of, head_of, lines_of, microseconds
+from ..measures import is_unit_row
+from ..readers.formats import is_binary, values_of
+from ..readers.tables import ABSENT, ORDERS, Dialect, cells_of, file_fields, head_of, lines_of, microseconds
 from .examine import RULE
-from .roles import is_unit_row
 
 MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
@@ -55,6 +56,10 @@ class TableHead:
 
 def look_at(path: Path) -> TableHead:
     """Return how a file is written; a text file by the reading with most rows of numbers of equal width."""
+    if is_binary(path):
+        fields, units = file_fields(path, Dialect())
+        rows = (tuple(map(str, row)) for row in values_of(path, fields)[: RULE.rows].tolist())
+        return TableHead(Dialect(), tuple(fields), tuple(units), tuple(rows))
     content = head_of(path)
     encoding = encoding_of(content)
     lines = lines_of(content, encoding, path)

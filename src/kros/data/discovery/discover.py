@@ -19,15 +19,16 @@ import numpy.typing as npt
 from ...core.errors import ConfigError, DataError
 from ...core.files import did_you_mean
 from ...core.work import Work
+from ..measures import split_header
 from ..population import EpisodeKey, Population
-from ..readers.csv_folder import ENDINGS, csv_files, read_csv_folder
+from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder
 from ..readers.tables import Dialect, file_fields, read_blocks
 from ..recording import CHECK, some, usable
 from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine, median_period
 from .filenames import infer_names, quoted
-from .roles import SECONDS, UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
+from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 Array = npt.NDArray[np.float64]
 _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
@@ -58,7 +59,7 @@ class Discovery:
 
 
 def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None) -> Discovery:
-    """Describe a folder of text tables."""
+    """Describe a folder of tables."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
     names = infer_names(list(alike))
@@ -111,10 +112,11 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str
 def _fits(path: Path, head: TableHead) -> bool:
     """Tell whether a file has the columns of the others, where they have them."""
     try:
-        fields = file_fields(path, head.dialect)
+        fields, _ = file_fields(path, head.dialect, head.fields)
     except DataError:
         return False
-    return set(head.fields) - {""} <= set(fields) if head.dialect.header else len(fields) == len(head.fields)
+    names, needed = ({split_header(name)[0] for name in of} for of in (fields, head.fields))
+    return needed - {""} <= names if head.dialect.header else len(fields) == len(head.fields)
 
 
 def _columns(
@@ -161,8 +163,7 @@ def _time(
     texts = [i for i in range(len(columns)) if head.timestamp(i) is not None]
     if candidates and (not texts or columns[numeric[candidates[0]]].kind == "time"):
         at = numeric[candidates[0]]
-        unit = columns[at].unit if columns[at].unit.lower() in SECONDS else ""
-        scale, why = time_scale(unit, float(np.median(np.diff(samples[0][candidates[0]]))))
+        scale, why = time_scale(columns[at], float(np.median(np.diff(samples[0][candidates[0]]))))
         keys: dict[str, Any] = {"time": columns[at].reference}
         return (at, keys, {}) if scale == 1 else (at, keys | {"time_scale": scale}, {"time_scale": why})
     if texts:
@@ -182,10 +183,10 @@ def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
 def _channel(column: TableColumn) -> dict[str, Any]:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
     role, measured = "input" if column.part is ColumnPart.INPUT else "state", column.part is ColumnPart.MEASURED
-    table: dict[str, Any] = {"name": column.name, "column": column.reference, "role": role}
-    table |= {"measured": measured, "unit": column.unit, "scale": column.scale}
-    default: dict[str, Any] = {"column": column.name, "measured": False, "unit": "", "scale": 1.0}
-    return {key: value for key, value in table.items() if value != default.get(key)}
+    table: dict[str, Any] = {"name": column.name, "column": column.reference, "column_unit": column.recorded}
+    table |= {"role": role, "measured": measured, "unit": column.unit, "scale": column.scale, "offset": column.offset}
+    default = {name: f.default for name, f in ChannelMapping.model_fields.items()} | {"column": column.name}
+    return {key: value for key, value in table.items() if value != default[key]}
 
 
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:

@@ -34,7 +34,7 @@ _MEASURE = re.compile(
 )
 _DATE = re.compile(r"^(?:19|20)\d{6}(?:T?\d{4,6})?$")
 _DATE_PARTS = (r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*")  # 2024-05-31
-_ENDING = re.compile(r"(.*?)((?:\.(?:csv|tsv|txt|dat|parquet))(?:\.gz)?)$", re.IGNORECASE)
+_ENDING = re.compile(r"(.*?)(\.(?:csv|tsv|txt|dat|parquet|mat|h5|hdf5?|mf4|mdf|tdms|bag|mcap|db3)(?:\.gz)?)$", re.I)
 Roles = list[str | None]
 Cut = list[list[str]]  # words of every path, with what is between them
 

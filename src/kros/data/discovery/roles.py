@@ -5,7 +5,6 @@ A column is time, a measured state, a hidden state, an input, or not needed.
 
 from __future__ import annotations
 
-import math
 import re
 import unicodedata
 from collections.abc import Collection, Sequence
@@ -15,35 +14,10 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from ...core.rounding import AGREED
+from ..measures import Measure, clean_unit, measure, split_header
 from ..recording import CHECK
 
 Array = npt.NDArray[np.float64]
-_TIMES = {1.0: "s sec seconds sek", 1e-3: "ms msec", 1e-6: "us µs μs", 1e-9: "ns", 60.0: "min", 3600.0: "h"}
-SECONDS = {unit: factor for factor, units in _TIMES.items() for unit in units.split()}
-_KINDS = {
-    "angle": "rad mrad deg ° grad rev turn turns u umdr",
-    "position": "m mm cm um µm μm km in inc counts cnt",
-    "velocity": "rad/s deg/s °/s m/s mm/s cm/s rpm 1/min u/min min-1 min^-1 rev/s upm hz",
-    "acceleration": "m/s2 m/s^2 m/s² rad/s2 rad/s^2 rad/s² deg/s² °/s²",
-    "current": "a ma",
-    "voltage": "v mv",
-    "torque": "nm n·m n*m mnm knm ncm",
-    "force": "n kn mn",
-    "pressure": "pa kpa mpa hpa bar mbar psi",
-    "temperature": "°c degc k °f c",
-    "other": "w kw kg g % - 1 l/min l/s pct percent none bool hex dez",
-    "time": " ".join(SECONDS),
-}
-KIND_OF = {unit: kind for kind, units in _KINDS.items() for unit in units.split()}
-_ANGLES = {"deg ° grad": math.pi / 180, "mrad": 1e-3, "rev turn turns umdr": 2 * math.pi}
-_SPEEDS = {"deg/s °/s": math.pi / 180, "rpm 1/min u/min min-1 min^-1 upm": math.pi / 30, "rev/s": 2 * math.pi}
-_TO_RADIANS = {
-    unit: (factor, base)
-    for base, factors in (("rad", _ANGLES), ("rad/s", _SPEEDS))
-    for units, factor in factors.items()
-    for unit in units.split()
-}
 WORDS = {
     "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl ref reference "
     "sollgeschwindigkeit consigne con ctrl control input inputs pwm duty stell stellgroesse stellwert feedforward "
@@ -67,8 +41,6 @@ _OF_WORD = {word: kind for kind, words in WORDS.items() for word in words.split(
 UNKNOWN = "not recognised"
 _STATES = ("angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration")
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
-_BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
-_AFTER = re.compile(r"^(.+?)(?:\s+in\s+|\s*/\s*|\s*,\s*|\s+)(\S+)$")
 _LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
 _SPELLED = dict(zip("äöüßÄÖÜΔωφθατ", _LETTERS.split(), strict=True))
 
@@ -91,6 +63,8 @@ class TableColumn:
     name: str  # of the channel
     unit: str = ""  # unit of measure of the channel, after scaling
     scale: float = 1.0  # to the channel
+    offset: float = 0.0  # added after scaling
+    recorded: str = ""  # unit of measure of the column itself
     kind: str = ""  # kind of quantity, or nothing
     part: ColumnPart = ColumnPart.LEFT_OUT
     why: str = ""  # what the proposal rests on
@@ -100,46 +74,6 @@ class TableColumn:
     def reference(self) -> str | int:
         """How a mapping names the column."""
         return self.header if self.number is None else self.number
-
-
-def _bare(text: str) -> str:
-    return text.strip().strip("[](){}").strip()
-
-
-def _plain(unit: str) -> str:
-    return _bare(unicodedata.normalize("NFC", unit)).lower().replace(" ", "").replace("º", "°")
-
-
-def split_header(text: str) -> tuple[str, str]:
-    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A`` or ``time_ms``."""
-    text = text.strip()
-    bracketed, after = _BRACKETED.match(text), _AFTER.match(text)
-    if bracketed and bracketed[1]:
-        return bracketed[1].strip(), bracketed[2]
-    if after and _plain(after[2]) in KIND_OF and (len(after[2]) > 1 or "/" in text or " in " in text):
-        return after[1].strip(), after[2]
-    stem, _, last = text.rpartition("_")
-    unit = _plain(last) in KIND_OF and (len(last) > 1 or last == "s") and last not in ("in", "no", "none", "min")
-    return (stem, last) if stem and unit else (text, "")
-
-
-def is_unit_row(cells: Sequence[str]) -> bool:
-    """Tell whether a row holds units of measure."""
-    written = [c.strip() for c in cells if c.strip()]
-    units = sum(_plain(c) in KIND_OF or (c.startswith("[") and c.endswith("]")) for c in written)
-    return bool(written) and 2 * units > len(written)
-
-
-def clean_unit(text: str) -> str:
-    """Return a unit without brackets; nothing for a dash."""
-    bare = _bare(text)
-    return {"-": "", "1": "", "none": "", "°": "deg", "°/s": "deg/s"}.get(bare, bare)
-
-
-def unit_of_factor(factor: float, unit: str) -> str:
-    """Return the unit of measure that is so many radians, or radians per second; nothing where none is known."""
-    sizes = ((name, size) for name, (size, base) in _TO_RADIANS.items() if base == unit)
-    return next((name for name, size in sizes if math.isclose(size, factor, rel_tol=AGREED)), "")
 
 
 def identifier(text: str, taken: Collection[str] = ()) -> str:
@@ -155,15 +89,13 @@ def identifier(text: str, taken: Collection[str] = ()) -> str:
 
 
 def describe(header: str, unit: str, taken: Collection[str]) -> TableColumn:
-    """Return a column by its header and the unit in a row of units, without a part."""
+    """Return a column by its header and the unit that a file states elsewhere, without a part."""
     stem, written = split_header(header)
     unit = clean_unit(unit) or clean_unit(written)
     name = header if header.isidentifier() and not written else stem
     name = identifier(f"column_{name}" if name.isdigit() else name, taken)
-    kind = kind_of(stem, unit)
-    radians = _TO_RADIANS.get(_plain(unit)) if kind in ("angle", "velocity", "position") else None
-    scale, unit = radians or (1.0, unit)
-    return TableColumn(header, name, unit, scale, kind)
+    known = measure(unit) or Measure(unit, 1.0, 0.0)
+    return TableColumn(header, name, known.si, known.factor, known.offset, unit, kind_of(stem, unit))
 
 
 def _kinds_of(name: str) -> list[str]:
@@ -175,9 +107,9 @@ def _kinds_of(name: str) -> list[str]:
 
 def kind_of(name: str, unit: str = "") -> str:
     """Return the kind of quantity that a channel is, by its unit of measure or its name, or nothing."""
-    of_unit = KIND_OF.get(_plain(unit), "other")
+    known = measure(unit)
     quantities = (kind for kind in _kinds_of(name) if kind not in ("", "input", "spare"))
-    return next(quantities, "") if of_unit == "other" else of_unit
+    return next(quantities, "") if known is None or known.kind == "other" else known.kind
 
 
 def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[int]:
@@ -198,13 +130,13 @@ def _counts(column: Array) -> bool:
     return bool((np.diff(column) == 1).all())
 
 
-def time_scale(unit: str, step: float) -> tuple[float, str]:
+def time_scale(column: TableColumn, step: float) -> tuple[float, str]:
     """Return the factor from a column of time to seconds by its unit, else the size of its steps, and the reason."""
-    if unit.lower() in SECONDS:
-        return SECONDS[unit.lower()], f"its unit of measure is {unit}"
-    for name in ("s", "ms", "us", "ns"):
-        if CHECK.shortest_s < SECONDS[name] * step < CHECK.longest_s:
-            return SECONDS[name], f"a step of {step:g} looks like {name}: correct time_scale if it is not"
+    if column.unit == "s":
+        return column.scale, f"its unit of measure is {column.recorded}"
+    for name, size in {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.items():
+        if CHECK.shortest_s < size * step < CHECK.longest_s:
+            return size, f"a step of {step:g} looks like {name}: correct time_scale if it is not"
     return 1.0, f"a step of {step:g} fits no unit of time: correct time_scale"
 
 

@@ -6,8 +6,10 @@ import codecs
 import logging
 import os
 import re
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,11 +20,13 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from ...core.errors import DataError
 from ...core.files import did_you_mean, read_toml
 from ...core.settings import Settings
+from ..measures import clean_unit, measure, split_header
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import Scale, Step
-from .tables import TIMESTAMP_SCALE, Dialect, file_fields, read_blocks
+from .formats import FORMATS
+from .tables import TIMESTAMP_SCALE, Dialect, file_fields, read_blocks, read_labels
 
 Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
@@ -34,9 +38,13 @@ class ChannelMapping(Settings):
     name: str = Field(description="of the channel, in everything that follows")
     role: Role = Field(description="what it is to the observer; a truth serves evaluation alone")
     column: Column | None = Field(None, description="name in the header or number from 1; default: the channel's name")
+    column_unit: str = Field(
+        "", description="unit of measure of the column; a file that states another one is converted, or refused"
+    )
     measured: bool = Field(False, description="whether a state is available at run time")
     unit: str = Field("", description="unit of measure after scaling")
     scale: float = Field(1.0, description="factor from the column to the channel")
+    offset: float = Field(0.0, description="added after scaling, as from degC to K, in the channel's unit")
     truth_of: str = Field("", alias="of", description="for the role `truth`: the state that it is the truth of")
 
     @property
@@ -52,8 +60,15 @@ class UnitMapping(Settings):
     columns: dict[str, Column] = Field({}, description="column by channel, where it is not that of `[[channel]]`")
 
 
+class Trigger(Settings):
+    """``trigger``: every stretch of rows in which a column is above a threshold is an episode."""
+
+    column: Column = Field(description="name in the header or number from 1")
+    above: float = Field(description="threshold, in the column's unit")
+
+
 class CsvMapping(Settings):
-    r"""How a folder of CSV files maps to a population; a file that does not match `files` is left alone."""
+    r"""How a folder of tables maps to a population; a file that does not match `files` is left alone."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
@@ -80,6 +95,13 @@ class CsvMapping(Settings):
     )
     pieces: int = Field(
         1, ge=1, le=100_000, description="a file is cut into episodes of equal length, `<episode>.1` ..."
+    )
+    labels: dict[Literal["unit", "condition", "episode"], Column] = Field(
+        {}, description='columns that state of every row what it belongs to, for example `{unit = "serial"}`'
+    )
+    trigger: Trigger | None = Field(
+        None,
+        description="every stretch of rows in which a column is above a threshold is an episode, `<episode>.1` ...",
     )
     prepare: tuple[dict[str, Any] | Step, ...] = Field((), description="preparation steps of this mapping")
     metadata: dict[str, Any] = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
@@ -121,8 +143,7 @@ class CsvMapping(Settings):
             if unknown := sorted(set(unit.columns) - set(names)):
                 gives = f"[[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}"
                 raise ValueError(f"{gives}; the channels are {names}")
-        columns = (self.time, *(self.column(c, u) for u in self.units for c in self.channel))
-        named = next((column for column in columns if isinstance(column, str)), None)
+        named = next((column for column in self.declared if isinstance(column, str)), None)
         if named is not None and not self.header:
             raise ValueError(f"header = false leaves columns without names, found {named!r}; give its number from 1")
         return self
@@ -131,6 +152,12 @@ class CsvMapping(Settings):
     def units(self) -> tuple[UnitMapping, ...]:
         """The units of one file; one without a suffix where none is declared."""
         return self.unit or (UnitMapping(),)
+
+    @property
+    def declared(self) -> tuple[Column | None, ...]:
+        """All columns that it names; of time none where there is no such column."""
+        labels = (*self.labels.values(), *([self.trigger.column] if self.trigger else []))
+        return (self.time, *labels, *(self.column(c, u) for u in self.units for c in self.channel))
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
@@ -145,7 +172,7 @@ class CsvMapping(Settings):
     @property
     def steps(self) -> tuple[Step, ...]:
         """Scaling as declared per channel, then the mapping's own steps."""
-        scales = (Scale((c.name,), c.scale) for c in self.ordered if c.scale != 1)
+        scales = (Scale((c.name,), c.scale, offset=c.offset) for c in self.ordered if (c.scale, c.offset) != (1, 0))
         return (*scales, *parse_steps(self.prepare, "CSV mapping: prepare"))
 
     @property
@@ -188,7 +215,7 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz")
+ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", *FORMATS)
 DEFAULT_UNIT = "unit"
 DEFAULT_EPISODE = "0"
 _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
@@ -196,12 +223,14 @@ _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class FilePlace:
-    """Where an episode is: a file, its columns, the positions of those wanted (time first), which piece of how many."""
+    """Where an episode is: a file, its columns, the positions of those wanted (time first), rows, and which piece."""
 
     path: str
     fields: tuple[str, ...]
     wanted: tuple[int, ...]
-    piece: tuple[int, int] = (0, 1)
+    conversion: tuple[tuple[float, float], ...] = ()  # factor and offset of those wanted, where units differ
+    rows: tuple[int, int] | None = None
+    piece: tuple[int, int] = (0, 1)  # of how many
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,13 +248,14 @@ class CsvRecordings(Recordings):
     def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
         """Return one episode as recorded."""
         (values,), (i, n) = self._values(place, np.inf), place.piece
+        values = values if place.rows is None else values[slice(*place.rows)]
         part = values[i * len(values) // n : (i + 1) * len(values) // n]
         return self._recording(key, part, part[:1])
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
-        """Yield one episode in blocks, unless it is a piece of a file."""
+        """Yield one episode in blocks, unless it is a part of a file."""
         place = self.places[key]
-        if place.piece[1] > 1:
+        if place.piece[1] > 1 or place.rows is not None:
             yield self(key)
             return
         first, waiting = np.empty(0), list[Recording]()
@@ -236,8 +266,10 @@ class CsvRecordings(Recordings):
         yield waiting[0].ended()
 
     def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
-        """Yield the columns of a file in blocks."""
-        return read_blocks(Path(place.path), place.fields, place.wanted, self.dialect, self.timestamp, rows)
+        """Yield the columns of a file in blocks, in the units of measure that are declared."""
+        factors, offsets = np.array(place.conversion or [(1.0, 0.0)]).T
+        blocks = read_blocks(Path(place.path), place.fields, place.wanted, self.dialect, self.timestamp, rows)
+        return (values * factors + offsets if place.conversion else values for values in blocks)
 
     def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
         """Return samples with their time, the first column if there is one, since the `first` of an episode."""
@@ -257,21 +289,16 @@ def read_csv_folder(
     places: dict[EpisodeKey, FilePlace] = {}
     groups: dict[str, str] = {}
     for path, match in _matches(source, chosen):
-        fields = file_fields(path, chosen.dialect)
+        fields, stated = file_fields(path, chosen.dialect, chosen.declared)
         if optional and not places:
             chosen = chosen.without(_absent(chosen, fields, optional))
         named = {name: text for name, text in match.groupdict().items() if text}
-        for unit in chosen.units:
-            place, group = _place(path, fields, chosen, unit), named.get("group", "")
-            name, condition = named.get("unit", DEFAULT_UNIT) + unit.suffix, named.get("condition", DEFAULT_CONDITION)
-            for i in range(chosen.pieces):
-                ending = f".{i + 1}" if chosen.pieces > 1 else ""
-                key = EpisodeKey(name, condition, named.get("episode", DEFAULT_EPISODE) + ending)
-                if key in places:
-                    twice = f"{key} is in {places[key].path} and in {path}"
-                    raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
-                check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
-                places[key] = replace(place, piece=(i, chosen.pieces))
+        for key, place in _episodes(path, fields, stated, named, chosen):
+            if key in places:
+                twice = f"{key} is in {places[key].path} and in {path}"
+                raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
+            check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
+            places[key], group = place, named.get("group", "")
             if groups.setdefault(key.unit, group) != group:
                 both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
                 raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
@@ -285,6 +312,41 @@ def read_csv_folder(
     units = [Unit(unit, group) for unit, group in groups.items()]
     facts = (chosen.channels, units, chosen.sample_period_s, chosen.metadata)
     return assemble(recordings, *facts, steps=chosen.steps, scaling=chosen.scaling)
+
+
+def _episodes(
+    path: Path, fields: list[str], stated: list[str], named: dict[str, str], mapping: CsvMapping
+) -> Iterator[tuple[EpisodeKey, FilePlace]]:
+    """Yield the episodes of a file, of which its name says some parts."""
+    places = [(unit.suffix, _place(path, fields, stated, mapping, unit)) for unit in mapping.units]
+    for labels, number, rows in _stretches(path, fields, mapping):
+        parts = {"unit": DEFAULT_UNIT, "condition": DEFAULT_CONDITION, "episode": DEFAULT_EPISODE, **named, **labels}
+        for suffix, place in places:
+            for i in range(mapping.pieces):
+                episode = parts["episode"] + number + (f".{i + 1}" if mapping.pieces > 1 else "")
+                key = EpisodeKey(parts["unit"] + suffix, parts["condition"], episode)
+                yield key, replace(place, rows=rows, piece=(i, mapping.pieces))
+
+
+def _stretches(
+    path: Path, fields: list[str], mapping: CsvMapping
+) -> Iterator[tuple[dict[str, str], str, tuple[int, int] | None]]:
+    """Yield what columns state of every episode in a file, its number and its rows; None where it is the whole file."""
+    labels, trigger = mapping.labels, mapping.trigger
+    if not labels and trigger is None:
+        yield {}, "", None
+        return
+    columns = [read_labels(path, fields, _position(path, fields, c), mapping.dialect) for c in labels.values()]
+    if trigger is not None:
+        (values,) = read_blocks(path, fields, [_position(path, fields, trigger.column)], mapping.dialect)
+        columns.append((values[:, 0] > trigger.above).tolist())
+    start, counts = 0, Counter[Any]()
+    for state, rows in groupby(zip(*columns, strict=True)):
+        start, first = start + sum(1 for _ in rows), start
+        counts[state] += 1
+        if trigger is None or state[-1]:
+            number = "" if trigger is None else f".{counts[state]}"
+            yield dict(zip(labels, state, strict=False)), number, (first, start)
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
@@ -321,20 +383,38 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         log.warning(text, len(others), source, mapping.files, some(others))
 
 
-def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
+def _place(path: Path, fields: list[str], stated: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
     """Return where the channels of a unit are in a file."""
-    wanted = [] if mapping.time is None else [mapping.time]
-    wanted += [mapping.column(channel, unit) for channel in mapping.ordered]
-    numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for c, f in zip(wanted, fields, strict=False))
+    wanted = [] if mapping.time is None else [(mapping.time, "")]
+    wanted += [(mapping.column(channel, unit), channel.column_unit) for channel in mapping.ordered]
+    numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for (c, _), f in zip(wanted, fields, strict=False))
     if mapping.header and numbered:
         problem = f"one header line is needed, found numbers in the first line: {fields}"
         raise DataError(f"Reading {path}: {problem}; put the names of the columns first, or set header = false.")
-    return FilePlace(str(path), tuple(fields), tuple(_position(path, fields, column) for column in wanted))
+    at = tuple(_position(path, fields, *column) for column in wanted)
+    conversion = tuple(_conversion(path, *column, stated[i]) for column, i in zip(wanted, at, strict=True))
+    changed = any(pair != (1.0, 0.0) for pair in conversion)
+    return FilePlace(str(path), tuple(fields), at, conversion if changed else ())
 
 
-def _position(path: Path, fields: list[str], column: Column) -> int:
-    """Return the position of a column by its name or number."""
+def _conversion(path: Path, column: Column, declared: str, stated: str) -> tuple[float, float]:
+    """Return factor and offset from the unit that a file states of a column to the one that is declared."""
+    declared = declared or (split_header(column)[1] if isinstance(column, str) else "")
+    if not declared or not stated or clean_unit(declared) == stated:
+        return 1.0, 0.0
+    ours, theirs = measure(declared), measure(stated)
+    if ours is None or theirs is None or ours.si != theirs.si:
+        problem = f"column {column!r} is in {stated!r}, and declared in {declared!r}"
+        raise DataError(f"Reading {path}: {problem}; correct the file, or column_unit.")
+    return theirs.into(ours)
+
+
+def _position(path: Path, fields: list[str], column: Column, unit: str = "") -> int:
+    """Return the position of a column by its number or name, whatever unit stands in the header where one is declared."""
     places = [i for i, field in enumerate(fields) if column in (field, i + 1)]
+    name, written = split_header(str(column))
+    if not places and (unit or written):
+        places = [i for i, field in enumerate(fields) if split_header(field)[0] == name]
     if len(places) == 1:
         return places[0]
     problem = f"column {column!r} is missing{did_you_mean(column, fields) or ','} found {fields}"

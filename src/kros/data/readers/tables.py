@@ -7,7 +7,7 @@ import csv
 import gzip
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,8 @@ import numpy.typing as npt
 from ...core import limits
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened
+from ..measures import clean_unit, is_unit_row, split_header
+from .formats import columns_of, is_binary, values_of
 
 Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
@@ -42,8 +44,11 @@ class Dialect:
     unit_rows: int = 0  # lines between the header and the numbers
 
 
-def file_fields(path: Path, dialect: Dialect) -> list[str]:
-    """Return the names of a table's columns, or the first numbers where it has no header."""
+def file_fields(path: Path, dialect: Dialect, wanted: Collection[str | int | None] = ()) -> tuple[list[str], list[str]]:
+    """Return the names of a table's columns, or the first numbers where it has no header, and the units it states."""
+    if is_binary(path):
+        columns = columns_of(path, wanted)
+        return list(columns), [clean_unit(unit) for unit in columns.values()]
     needed = dialect.skip_rows + dialect.unit_rows + 2
     lines = lines_of(head_of(path, 1000 * needed), dialect.encoding, path)
     lines = (lines if len(lines) > needed else lines_of(head_of(path), dialect.encoding, path))[dialect.skip_rows :]
@@ -59,7 +64,9 @@ def file_fields(path: Path, dialect: Dialect) -> list[str]:
         raise DataError(f"Reading {path}: its first line is no list of columns ({error}); correct the file.") from error
     width = len(rows[-1]) if dialect.header and len(rows) > dialect.unit_rows else len(fields)
     spare = (*fields[width:], *(rows[-1][len(fields) :] if width > len(fields) else ()))  # of delimiters at line ends
-    return fields if width < 2 or any(spare) else (fields + [""] * width)[:width]
+    fields = fields if width < 2 or any(spare) else (fields + [""] * width)[:width]
+    units = next(filter(is_unit_row, rows[: dialect.unit_rows]), [split_header(name)[1] for name in fields])
+    return fields, [clean_unit(unit) for unit in (units + [""] * len(fields))[: len(fields)]]
 
 
 def head_of(path: Path, size: int = HEAD) -> bytes:
@@ -104,6 +111,9 @@ def read_blocks(
 
     With the order of a date in `timestamp` the first one holds timestamps, which become microseconds.
     """
+    if is_binary(path):
+        yield values_of(path, [fields[i] for i in wanted])
+        return
     waiting = [np.empty((0, len(wanted)))]
     for part in _parts(path, fields, wanted, dialect, timestamp):
         if len(part) > 1 and sum(map(len, waiting)) >= rows:
@@ -113,15 +123,32 @@ def read_blocks(
     yield np.concatenate(waiting)
 
 
+def read_labels(path: Path, fields: Sequence[str], column: int, dialect: Dialect) -> list[str]:
+    """Return a column as text."""
+    if is_binary(path):
+        return [f"{value:g}" for value in values_of(path, [fields[column]])[:, 0]]
+    batches = _batches(path, fields, [column], dialect, {column})
+    return [str(text).strip() for (labels,) in batches for text in labels.to_pylist()]
+
+
 def _parts(
     path: Path, fields: Sequence[str], wanted: Sequence[int], dialect: Dialect, timestamp: str | None
 ) -> Iterator[Array]:
     """Yield columns of a table as Arrow cuts it."""
+    for columns in _batches(path, fields, wanted, dialect, set() if timestamp is None else {wanted[0]}):
+        first = [] if timestamp is None else [microseconds(columns.pop(0), timestamp)]
+        yield np.column_stack([*first, *map(to_numpy, columns)])
+
+
+def _batches(
+    path: Path, fields: Sequence[str], wanted: Sequence[int], dialect: Dialect, texts: Collection[int]
+) -> Iterator[list[Any]]:
+    """Yield columns of a table as Arrow arrays of numbers, or of texts."""
     import pyarrow as pa
     from pyarrow import csv as arrow
 
     names = [str(i) for i in range(len(fields))]
-    kinds = {names[i]: pa.float64() for i in wanted} | ({} if timestamp is None else {names[wanted[0]]: pa.string()})
+    kinds = {names[i]: pa.string() if i in texts else pa.float64() for i in wanted}
     lines = dialect.skip_rows + (1 + dialect.unit_rows if dialect.header else 0)
     options = (
         arrow.ReadOptions(use_threads=False, column_names=names, block_size=BLOCK, skip_rows=lines),
@@ -135,9 +162,7 @@ def _parts(
     )
     with _explained(path, fields, dialect), opened(path, dialect.encoding) as file:
         for batch in arrow.open_csv(pa.PythonFile(file, mode="r"), *options):
-            columns = [batch.column(names[i]) for i in wanted]
-            first = [] if timestamp is None else [microseconds(columns.pop(0), timestamp)]
-            yield np.column_stack([*first, *map(to_numpy, columns)])
+            yield [batch.column(names[i]) for i in wanted]
 
 
 @contextmanager

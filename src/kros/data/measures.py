@@ -1,0 +1,134 @@
+"""Units of measure: how headers write them, what kind of quantity they measure, and their conversion to SI by pint."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from ..core.rounding import AGREED
+
+# SI units as kros writes them, with the kind of quantity
+_SI = """
+rad angle|rad/s velocity|rad/s^2 acceleration|m position|m/s velocity|m/s^2 acceleration|s time|Hz velocity|A current
+V voltage|N m torque|N force|Pa pressure|K temperature|W other|kg other|ohm other|H other|F other|T other
+"""
+# what is written otherwise than pint does, and German
+_SPELLED = """
+° deg|grad deg|rev turn|revs turn|turns turn|u turn|umdr turn|upm rpm|1/min rpm|u/min rpm|min-1 rpm|min^-1 rpm|1/s Hz
+rev/s turn/s|rev/min rpm|a A|v V|w W|n N|pa Pa|kpa kPa|hz Hz|k K|c degC|°c degC|°f degF|sek s|°/s deg/s|°/s^2 deg/s^2
+Nm N*m|mNm mN*m|kNm kN*m|Ncm N*cm|kn kN
+"""
+# what is a unit without brackets, too, in the order in which names are chosen
+_WORDS = """
+rad mrad deg ° grad rev turn turns u umdr m mm cm µm μm um km in inch counts cnt rad/s deg/s °/s m/s mm/s cm/s km/h rpm
+1/min u/min min-1 min^-1 rev/s upm Hz m/s2 m/s^2 m/s² rad/s2 rad/s^2 rad/s² deg/s² °/s² A mA kA V mV kV Nm N·m N*m mNm
+kNm Ncm N kN MN Pa kPa MPa hPa bar mbar psi °C degC K °F degF C W kW kg g % - 1 l/min l/s pct percent none bool hex dez
+s sec seconds sek ms msec us µs μs ns min h mbar
+"""
+_EXPRESSION = re.compile(r"[^\W\d_]+(?:\^-?\d)?(?:[*/ ][^\W\d_]+(?:\^-?\d)?)*")
+_BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
+_AFTER = re.compile(r"^(.+?)(?:\s+in\s+|\s*/\s*|\s*,\s*|\s+)(\S+)$")
+
+
+def _pairs(table: str) -> dict[str, str]:
+    return {name: text for row in re.split(r"[|\n]", table.strip()) for name, _, text in [row.rpartition(" ")]}
+
+
+_KINDS = _pairs(_SI)
+_PINT = _pairs(_SPELLED)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A unit of measure: a value in it, times `factor` plus `offset`, is the value in the unit `si`."""
+
+    si: str
+    factor: float
+    offset: float
+
+    @property
+    def kind(self) -> str:
+        """Kind of quantity."""
+        return _KINDS[self.si]
+
+    def into(self, other: Measure) -> tuple[float, float]:
+        """Return factor and offset from this unit to another one of the same quantity."""
+        return self.factor / other.factor, (self.offset - other.offset) / other.factor
+
+
+def bare(text: str) -> str:
+    """Return a unit without brackets and spaces around it."""
+    return unicodedata.normalize("NFC", text).strip().strip("[](){}").strip().replace("º", "°")
+
+
+def is_word(text: str) -> bool:
+    """Tell whether a text is a unit of measure where no bracket says so."""
+    return bare(text).lower().replace(" ", "") in {word.lower() for word in _WORDS.split()}
+
+
+def clean_unit(text: str) -> str:
+    """Return a unit without brackets; nothing for a dash."""
+    return {"-": "", "1": "", "none": "", "°": "deg", "°/s": "deg/s"}.get(bare(text), bare(text))
+
+
+@cache
+def _registry() -> tuple[Any, dict[Any, str]]:
+    """Return the registry of pint, and the SI units of `_SI` by what they are in base units."""
+    import pint
+
+    registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    return registry, {_in_base(registry, 1, name).units: name for name in _KINDS}
+
+
+def _in_base(registry: Any, value: float, unit: str) -> Any:
+    return registry.Quantity(value, registry.parse_units(unit)).to_base_units()
+
+
+@cache
+def measure(unit: str) -> Measure | None:
+    """Return what a text measures; None where it is no unit of a quantity that kros writes in SI."""
+    text = re.sub(r"(?<=[a-zA-Z])([23])$", r"^\1", bare(unit).replace("²", "^2").replace("³", "^3").replace("·", "*"))
+    text = _PINT.get(text, _PINT.get(text.lower().replace(" ", ""), text))
+    if not _EXPRESSION.fullmatch(text):  # pint computes what it parses
+        return None
+    registry, names = _registry()
+    try:
+        zero, one, two = (_in_base(registry, value, text) for value in (0, 1, 2))
+    except (AttributeError, ArithmeticError, AssertionError, LookupError, TypeError, ValueError):
+        return None  # the errors of pint for what it does not know
+    linear = math.isclose(two.magnitude - one.magnitude, one.magnitude - zero.magnitude, rel_tol=AGREED)
+    if one.units not in names or not linear:
+        return None
+    offset = float(zero.magnitude)
+    return Measure(names[one.units], float((one - zero).magnitude), offset)
+
+
+def unit_of_factor(factor: float, unit: str) -> str:
+    """Return the unit of measure that is so many of an SI unit; nothing where none is known."""
+    sizes = ((name, m) for name in _WORDS.split() if (m := measure(name)) is not None and m.si == unit)
+    return next((name for name, m in sizes if math.isclose(m.factor, factor, rel_tol=AGREED)), "")
+
+
+def split_header(text: str) -> tuple[str, str]:
+    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A`` or ``time_ms``."""
+    text = text.strip()
+    bracketed, after = _BRACKETED.match(text), _AFTER.match(text)
+    if bracketed and bracketed[1]:
+        return bracketed[1].strip(), bracketed[2]
+    if after and is_word(after[2]) and (len(after[2]) > 1 or "/" in text or " in " in text):
+        return after[1].strip(), after[2]
+    stem, _, last = text.rpartition("_")
+    unit = is_word(last) and (len(last) > 1 or last == "s") and last not in ("in", "no", "none", "min")
+    return (stem, last) if stem and unit else (text, "")
+
+
+def is_unit_row(cells: Sequence[str]) -> bool:
+    """Tell whether a row holds units of measure."""
+    written = [c.strip() for c in cells if c.strip()]
+    units = sum(is_word(c) or (c.startswith("[") and c.endswith("]")) for c in written)
+    return bool(written) and 2 * units > len(written)

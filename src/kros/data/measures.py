@@ -81,7 +81,7 @@ def _registry() -> tuple[Any, dict[Any, str]]:
     """Return the registry of pint, and the SI units of `_SI` by what they are in base units."""
     import pint
 
-    registry = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+    registry: Any = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
     return registry, {_in_base(registry, 1, name).units: name for name in _KINDS}
 
 

@@ -58,8 +58,8 @@ def look_at(path: Path) -> TableHead:
     """Return how a file is written; a text file by the reading with most rows of numbers of equal width."""
     if is_binary(path):
         fields, units = file_fields(path, Dialect())
-        rows = (tuple(map(str, row)) for row in values_of(path, fields)[: RULE.rows].tolist())
-        return TableHead(Dialect(), tuple(fields), tuple(units), tuple(rows))
+        cells = tuple(tuple(map(str, row)) for row in values_of(path, fields)[: RULE.rows].tolist())
+        return TableHead(Dialect(), tuple(fields), tuple(units), cells)
     content = head_of(path)
     encoding = encoding_of(content)
     lines = lines_of(content, encoding, path)

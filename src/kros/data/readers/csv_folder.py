@@ -347,6 +347,9 @@ def _stretches(
         if trigger is None or state[-1]:
             number = "" if trigger is None else f".{counts[state]}"
             yield dict(zip(labels, state, strict=False)), number, (first, start)
+    if trigger is not None and not any(state[-1] for state in counts):
+        problem = f"column {trigger.column!r} is nowhere above {trigger.above:g}"
+        raise DataError(f"Reading {path}: {problem}; lower the threshold of the trigger, or exclude the file.")
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:

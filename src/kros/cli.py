@@ -222,7 +222,7 @@ def main(
 
 @app.command()
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of CSV files.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of recordings.")],
     measured: Annotated[Names, _option("State that is available at run time; repeatable.", metavar="NAME")] = None,
     input_: Annotated[Names, _option("Input; repeatable.", "--input", metavar="NAME")] = None,
     out: Annotated[Path, _option("New study file.")] = Path("study.toml"),
@@ -398,6 +398,14 @@ def list_(run_folder: Run) -> None:
     from .study.commands.summary import list_run
 
     _say(list_run(run_folder))
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of study files, for editors; kros init writes it beside the study."""
+    from .study.config import study_schema
+
+    _json(study_schema())
 
 
 @app.command()

@@ -8,11 +8,13 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, TypeAdapter, field_validator
 
 from ..core.errors import ConfigError
 from ..core.files import read_toml, shortened
 from ..core.settings import Settings
+from ..data.readers.csv_folder import CsvMapping
+from ..data.steps import STEPS
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
 from ..observer import EstimatorSettings
@@ -44,7 +46,7 @@ class DataConfig(Settings):
     """Where the recordings are and how they are prepared."""
 
     source: Path = Field(description="folder of the recordings, relative to the study file")
-    reader: str = Field("motor-drive-raw", description="motor-drive-raw, csv or parquet")
+    reader: str = Field("motor-drive-raw", description="motor-drive-raw, csv (tables in files of any kind) or parquet")
     exclude: tuple[str, ...] = Field((), description="units that take no part in anything")
     identify_on: str | None = Field(
         None, description="condition that models and observers are made from; by default noload, or else the first"
@@ -177,6 +179,20 @@ def validate_config(
     config = StudyConfig.of(raw, f"Study {origin}")
     source = (base / config.data.source).resolve()
     return config.model_copy(update={"data": config.data.model_copy(update={"source": source})})
+
+
+def study_schema() -> dict[str, Any]:
+    """Return the JSON schema of a study file, with the mapping of recordings and the preparation steps."""
+    schema, mapping = StudyConfig.model_json_schema(), CsvMapping.model_json_schema()
+    schema["$defs"] |= {**mapping.pop("$defs"), "CsvMapping": mapping}
+    steps = {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()}
+    for name, step in steps.items():
+        step["properties"]["step"] = {"const": name}
+    data = schema["$defs"]["DataConfig"]["properties"]
+    data["csv"] = {"$ref": "#/$defs/CsvMapping"}
+    for properties in (data, mapping["properties"]):
+        properties["prepare"]["items"] = {"oneOf": list(steps.values())}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def stored_config(raw: Any, path: Path) -> StudyConfig:

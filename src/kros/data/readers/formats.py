@@ -69,8 +69,9 @@ def _tdms(path: Path) -> Iterator[Group]:
     """TDMS: the time of a group follows from the increment of its waveforms."""
     from nptdms import TdmsFile
 
-    for group in TdmsFile.read(path).groups():
-        signals: Any = group.channels()
+    groups: list[Any] = TdmsFile.read(path).groups()
+    for group in groups:
+        signals = group.channels()
         waveform = next((c for c in signals if "wf_increment" in c.properties), None)
         time = {} if waveform is None else {"time": waveform.properties["wf_increment"] * np.arange(len(waveform))}
         units = {c.name: str(c.properties.get("unit_string", "")) for c in signals}

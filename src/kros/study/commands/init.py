@@ -21,14 +21,14 @@ from ...data.readers.csv_folder import CsvMapping
 from ...data.readers.opening import detect_reader
 from ...data.recording import check_population
 from ...data.survey import UNLOADED, survey
-from ..config import validate_config
+from ..config import study_schema, validate_config
 from ..stages.learning import FEWEST, open_source
 
 
 def study_text(source: Path, data: Mapping[str, Any], discovery: Discovery | None, findings: Sequence[str]) -> str:
     """Return a study as TOML."""
     written = f"Written by kros init from the recordings in {source.name}. It can be run as it is; edit any line."
-    lines = _comment(written)
+    lines = [f"#:schema ./{SCHEMA}", *_comment(written)]
     if findings:
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in _comment(f"- {text}"))]
     lines += ["", "[data]", *_keys({key: data[key] for key in ("source", "reader", "on_nan") if key in data})]
@@ -99,6 +99,7 @@ def _comment(text: str) -> list[str]:
 
 
 log = logging.getLogger(__name__)
+SCHEMA = "study.schema.json"  # which editors look up by the first line of a study
 _UNLOADED_WORDS = "unloaded noload leerlauf ohnelast unbelastet leer idle empty vide avide sanscharge"
 NO_LOAD = _UNLOADED_WORDS.split()
 
@@ -136,6 +137,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     validate_config(tomllib.loads(text), folder, str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
+    out.with_name(SCHEMA).write_text(json.dumps(study_schema(), indent=1), encoding="utf-8")
     until = " --until identify" if len(population.units) < FEWEST else ""
     lines = [repr(population), *([discovery.reading] if discovery else [])]
     lines += [f"looks wrong: {text}" for text in findings]

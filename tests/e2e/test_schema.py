@@ -1,0 +1,66 @@
+"""The JSON schema of study files, checked by a validator that editors do not share code with."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kros.plants import DcMotorPopulation
+
+pytest.importorskip("check_jsonschema")
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def check(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "check_jsonschema", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def study(kros, tmp_path_factory) -> Path:
+    """A study that `kros init` wrote, with its schema."""
+    folder = tmp_path_factory.mktemp("schema")
+    motors = DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.2, seed=1).simulate().population
+    (folder / "recordings").mkdir()
+    for key in motors.episodes:
+        columns = {c.name: motors.read(key)[:, i].tolist() for i, c in enumerate(motors.channels)}
+        rows = zip(*columns.values(), strict=True)
+        lines = [f"t,{','.join(columns)}", *(f"{k / 500},{','.join(map(str, row))}" for k, row in enumerate(rows))]
+        (folder / "recordings" / f"motor{key.unit}_run{key.episode}.csv").write_text("\n".join(lines))
+    result = kros("init", folder / "recordings", "--out", folder / "study.toml")
+    assert result.exit_code == 0, result.output
+    return folder / "study.toml"
+
+
+def test_the_schema_is_one_and_is_printed(kros, study) -> None:
+    schema = study.with_name("study.schema.json")
+    assert check("--check-metaschema", schema).returncode == 0
+    assert json.loads(kros("schema").output) == json.loads(schema.read_text())
+    assert study.read_text().splitlines()[0] == "#:schema ./study.schema.json"
+
+
+def test_studies_are_valid_by_it(study) -> None:
+    examples = [path for path in EXAMPLES.glob("*/study.toml")]
+    assert len(examples) > 2
+    result = check("--schemafile", study.with_name("study.schema.json"), study, *examples)
+    assert result.returncode == 0, result.stdout
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "found"),
+    [
+        ("measured = true", "measurd = true", "'measurd' was unexpected"),
+        ('role = "input"', 'role = "output"', "'output' is not one of"),
+        ("[data.csv]", '[[data.prepare]]\nstep = "trim"\nbegin = 1\n[data.csv]', "prepare"),
+    ],
+)
+def test_mistakes_are_found(study, tmp_path, right, wrong, found) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(study.read_text().replace(right, wrong, 1))
+    result = check("--schemafile", study.with_name("study.schema.json"), path)
+    assert result.returncode == 1
+    assert found in result.stdout

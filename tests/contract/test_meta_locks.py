@@ -24,14 +24,14 @@ def requirements(text: str) -> list[str]:
 def faults(text: str) -> list[str]:
     """Lines that are not `name==version`, perhaps with a marker, followed by SHA-256 hashes."""
     good = re.compile(
-        r"[a-z0-9._-]+(?:\[[a-z,]+\])?==[\w.!+]+( *;[^-]*(?:-(?!-)[^-]*)*)?( +--hash=sha256:[0-9a-f]{64})+"
+        r"[a-z0-9._-]+(?:\[[a-z, ]+\])?==[\w.!+]+( *;[^-]*(?:-(?!-)[^-]*)*)?( +--hash=sha256:[0-9a-f]{64})+"
     )
     return [line[:80] for line in requirements(text) if not good.fullmatch(line)]
 
 
 def pins(name: str) -> dict[str, str]:
     lines = requirements((ROOT / name).read_text(encoding="utf-8"))
-    return dict(re.sub(r"\[.*\]", "", line.split(" ", 1)[0]).split("==") for line in lines)
+    return dict(re.sub(r"\[[^]]*\]", "", line).split(" ", 1)[0].split("==") for line in lines)
 
 
 def names(wanted: list[str]) -> set[str]:
@@ -62,7 +62,7 @@ def test_locks_hold_what_the_project_asks_for() -> None:
 def test_extras_that_packages_ask_for_are_pinned_with_them() -> None:
     """pip takes a newer `coverage` for `coverage[toml]` where the lock pins `coverage` alone, and refuses it."""
     lines = requirements((ROOT / DEV).read_text(encoding="utf-8"))
-    pinned = {line.split("==", 1)[0] for line in lines}
+    pinned = {line.split("==", 1)[0].replace(" ", "") for line in lines}
     asked = [Requirement(text) for d in distributions() for text in d.requires or [] if d.name.lower() in pins(DEV)]
     known = [
         r for r in asked if r.extras and r.name in pins(DEV) and (r.marker is None or r.marker.evaluate({"extra": ""}))

@@ -21,7 +21,7 @@ PIP := $(CLEAN_ENV) $(BIN)/python -m pip --disable-pip-version-check
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
 # A demo that shows that an installation works, in seconds of processor time.
-SHORT := --set identify.refine=false --set synthesis.input_weight=3.0 --set evaluate.robustness=false
+SHORT := --set identify.refine=false
 
 TEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --benchmark-skip
 

@@ -94,6 +94,11 @@ def measure(unit: str) -> Measure | None:
     """Return what a text measures; None where it is no unit of a quantity that kros writes in SI."""
     text = re.sub(r"(?<=[a-zA-Z])([23])$", r"^\1", bare(unit).replace("²", "^2").replace("³", "^3").replace("·", "*"))
     text = _PINT.get(text, _PINT.get(text.lower().replace(" ", ""), text))
+    return _measured(text) or _measured(text.lower())  # Volts, RPM
+
+
+def _measured(text: str) -> Measure | None:
+    """Return what an expression of pint measures."""
     if not _EXPRESSION.fullmatch(text):  # pint computes what it parses
         return None
     registry, names = _registry()
@@ -104,8 +109,7 @@ def measure(unit: str) -> Measure | None:
     linear = math.isclose(two.magnitude - one.magnitude, one.magnitude - zero.magnitude, rel_tol=AGREED)
     if one.units not in names or not linear:
         return None
-    offset = float(zero.magnitude)
-    return Measure(names[one.units], float((one - zero).magnitude), offset)
+    return Measure(names[one.units], float((one - zero).magnitude), float(zero.magnitude))
 
 
 def unit_of_factor(factor: float, unit: str) -> str:

@@ -94,12 +94,12 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
     """Run the stages and return processor time, s, and the largest memory after each, GB."""
     import kros
     from kros.core.work import Work
-    from kros.data.survey import survey
     from kros.identify.calibration import calibrate
     from kros.identify.identified import IdentifiedModels
     from kros.identify.identify import with_models
     from kros.identify.presets import resolve_lifting, resolve_phase
     from kros.identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
+    from kros.identify.survey import survey
     from kros.uncertainty.outliers.population import score_population
     from kros.uncertainty.quantify import choose_unit
     from kros.uncertainty.settings import QuantifySettings

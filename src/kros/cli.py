@@ -114,7 +114,7 @@ def log_to_stderr(verbose: bool) -> None:
     if logging.getLogger().handlers:
         return  # the log is read elsewhere
     handler = OnceHandler()
-    handler.addFilter(lambda record: verbose or record.name != "kros.data.survey")  # alerts stand behind the run
+    handler.addFilter(lambda record: verbose or record.name != "kros.identify.survey")  # alerts stand behind the run
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
     logging.captureWarnings(True)
 

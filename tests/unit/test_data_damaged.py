@@ -18,7 +18,7 @@ from kros.core import limits
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, prepare, read, steps, write_parquet
 from kros.data.readers.parquet import read_parquet
-from kros.data.survey import period_alerts
+from kros.identify.survey import period_alerts
 from kros.interop import from_pykoop
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))

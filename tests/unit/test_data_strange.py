@@ -11,7 +11,7 @@ from kros.core.errors import DataError
 from kros.data import Channel, Population, Role, from_arrays
 from kros.data.readers.csv_folder import read_csv_folder
 from kros.data.readers.opening import detect_reader
-from kros.data.survey import survey
+from kros.identify.survey import survey
 
 CHANNELS = (Channel("angle", Role.STATE, "", True), Channel("speed", Role.STATE), Channel("torque", Role.INPUT))
 UNITS, EPISODES, SAMPLES = 6, 4, 400

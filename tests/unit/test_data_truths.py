@@ -12,7 +12,7 @@ from kros.core.errors import DataError
 from kros.data import Channel, EpisodeBatch, Population, Role, from_arrays, prepare, read, steps, write_parquet
 from kros.data.prepare import scale_population
 from kros.data.readers.parquet import read_parquet
-from kros.data.survey import survey
+from kros.identify.survey import survey
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 TRUTH = Channel("v_true", Role.TRUTH, of="v")

@@ -7,7 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.data import split_episodes
-from kros.data.survey import RecordingFacts
+from kros.identify.survey import RecordingFacts
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.plants import HarmonicDrivePopulation

@@ -30,7 +30,7 @@ from ..core.errors import IdentificationError
 from ..core.rounding import TINY
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
-from ..data.survey import RecordingFacts
+from .survey import RecordingFacts
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]

@@ -15,11 +15,11 @@ import numpy.typing as npt
 from ..core.artifacts import Storable, load_artifact, loader, save_artifact
 from ..core.errors import DataError
 from ..data.population import Population
-from ..data.survey import RecordingFacts
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor
 from .model_set import KINDS, ModelSet, kinds_for
+from .survey import RecordingFacts
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")

@@ -22,7 +22,6 @@ from ..core.linalg import radius_text
 from ..core.settings import require_kind
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
-from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
@@ -33,6 +32,7 @@ from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .refine import RefineOptions, refine_population
 from .refine.metric import peak_residual
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
+from .survey import RecordingFacts, check_usable, survey
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from ..core.errors import ConfigError
 from ..core.settings import Settings
-from ..data.flat_tops import FoundLimit
+from ..identify.flat_tops import FoundLimit
 
 Array = npt.NDArray[np.float64]
 

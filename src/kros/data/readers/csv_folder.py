@@ -413,7 +413,7 @@ def _conversion(path: Path, column: Column, declared: str, stated: str) -> tuple
 
 
 def _position(path: Path, fields: list[str], column: Column, unit: str = "") -> int:
-    """Return the position of a column by its number or name, whatever unit stands in the header where one is declared."""
+    """Return the position of a column by number or name; a declared unit may differ from that in the header."""
     places = [i for i, field in enumerate(fields) if column in (field, i + 1)]
     name, written = split_header(str(column))
     if not places and (unit or written):

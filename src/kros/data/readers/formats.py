@@ -56,7 +56,8 @@ def _mdf(path: Path) -> Iterator[Group]:
     from asammdf import MDF
 
     with path.open("rb") as file, MDF(file) as recording:
-        for i, group in enumerate(recording.groups):
+        groups: list[Any] = recording.groups
+        for i, group in enumerate(groups):
             signals = [recording.get(group=i, index=j) for j in range(len(group.channels))]
             values = {s.name: s.samples for s in signals}
             for s in signals:
@@ -69,8 +70,7 @@ def _tdms(path: Path) -> Iterator[Group]:
     """TDMS: the time of a group follows from the increment of its waveforms."""
     from nptdms import TdmsFile
 
-    groups: list[Any] = TdmsFile.read(path).groups()
-    for group in groups:
+    for group in TdmsFile.read(path).groups():
         signals = group.channels()
         waveform = next((c for c in signals if "wf_increment" in c.properties), None)
         time = {} if waveform is None else {"time": waveform.properties["wf_increment"] * np.arange(len(waveform))}
@@ -136,7 +136,7 @@ def _chosen(path: Path, tables: Sequence[Mapping[str, str]], wanted: Collection[
 
 @cache
 def _heads(path: Path, version: tuple[int, int]) -> list[dict[str, str]]:
-    """Return the columns of all tables of a file with their units, which stay known: reading some formats takes long."""
+    """Return the columns of all tables of a file with their units, kept since reading some formats takes long."""
     return [{name: unit for name, (_, unit) in table.items()} for table in _tables(path, version)]
 
 

@@ -13,9 +13,9 @@ from ...core.errors import ConfigError, KrosError
 from ...core.files import did_you_mean
 from ...data import EpisodeBatch
 from ...data.discovery.roles import identifier
-from ...data.survey import RecordingFacts
 from ...evaluate.sensor import as_arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
+from ...identify.survey import RecordingFacts
 from ...loops.compiler import find_compiler
 from ...observer import Observer, run_observer
 from ...observer.units import recorded_factors

@@ -24,10 +24,10 @@ from ...core.rounding import AGREED
 from ...data import Population, read, split_episodes
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
-from ...data.survey import RecordingFacts
 from ...evaluate.sensor import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibration import segments_of
+from ...identify.survey import RecordingFacts
 from ...observer import Observer
 from ...observer.screen import Bits, SampleStatus
 from ...observer.simulate import Course

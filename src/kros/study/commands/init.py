@@ -20,7 +20,7 @@ from ...data.discovery.roles import ColumnPart, TableColumn
 from ...data.readers.csv_folder import CsvMapping
 from ...data.readers.opening import detect_reader
 from ...data.recording import check_population
-from ...data.survey import UNLOADED, survey
+from ...identify.survey import UNLOADED, survey
 from ..config import study_schema, validate_config
 from ..stages.learning import FEWEST, open_source
 

@@ -17,10 +17,10 @@ from ...core.artifacts import digest_of, load_artifact, write_json
 from ...core.work import Results, Work
 from ...data.population import EpisodeKey, Population
 from ...data.recording import NonFiniteError
-from ...data.survey import RecordingFacts
 from ...identify import PhaseCalibration, PhaseSpec
 from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
+from ...identify.survey import RecordingFacts
 from ...lifting import Lifting
 from ...uncertainty.quantify import UncertainModels
 from ..config import Stage, StudyConfig

@@ -10,13 +10,13 @@ from ...core.errors import ConfigError, DataError
 from ...data import Population, read
 from ...data.population import OUTLIERS
 from ...data.prepare import parse_steps, prepare
-from ...data.survey import Copy, check_usable, survey
 from ...design.synthesize import synthesize_all
 from ...evaluate.next_unit import draw_reserve
 from ...identify.calibration import calibrate
 from ...identify.identified import IdentifiedModels
 from ...identify.identify import with_models
 from ...identify.presets import resolve_lifting, resolve_phase
+from ...identify.survey import Copy, check_usable, survey
 from ...observer.residual.one_step import FEWEST_SAMPLES
 from ...observer.sensor import require_measured
 from ...uncertainty.quantify import quantify

@@ -22,12 +22,12 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, IdentificationError, KrosError
 from ...core.work import Progress
 from ...data.population import OUTLIERS, Population, split_episodes
-from ...data.survey import RecordingFacts
 from ...design.task import is_robust
 from ...evaluate.held_out import HeldOut, Outcome
 from ...evaluate.next_unit import fewest_units, next_unit_bound
 from ...identify.calibration import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
+from ...identify.survey import RecordingFacts
 from ...observer import Observer
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps

@@ -19,9 +19,9 @@ import numpy.typing as npt
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
-from ...data.flat_tops import FoundLimit
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
+from ...identify.flat_tops import FoundLimit
 from ...lifting import Lifting
 from ...motor_drive import AngleLoad
 from ...motor_drive.observer import LoadSettings, load_observer

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kros.data import EpisodeKey
-from kros.data.flat_tops import ends_of, found_limit
-from kros.data.survey import survey
+from kros.identify.flat_tops import ends_of, found_limit
+from kros.identify.survey import survey
 from kros.plants import PLANTS
 
 T = np.arange(4000) * 1e-3

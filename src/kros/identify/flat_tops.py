@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.rounding import ITERATED
-from .population import EpisodeKey
+from ..data.population import EpisodeKey
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]

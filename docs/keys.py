@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from kros.core.settings import Settings
-from kros.data.readers.csv_folder import ChannelMapping, CsvMapping, Trigger, UnitMapping
+from kros.data.readers.csv_folder import ChannelMapping, CsvMapping, UnitMapping
 from kros.data.steps import STEPS
 from kros.study.config import StudyConfig
 
@@ -119,7 +119,6 @@ def study_keys() -> str:
 def mapping_keys() -> str:
     """Return a section for every table of a mapping."""
     kinds = {"### At the top": CsvMapping, "### `[[channel]]`": ChannelMapping, "### `[[unit]]`": UnitMapping}
-    kinds["### `[trigger]`"] = Trigger
     return "\n".join(f"{title}\n\n{summary(kind)}\n\n{table(settings_rows(kind))}" for title, kind in kinds.items())
 
 

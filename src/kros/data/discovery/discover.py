@@ -26,7 +26,7 @@ from ..readers.tables import Dialect, file_fields, read_blocks
 from ..recording import CHECK, some, usable
 from ..steps import GAP
 from .dialect import TableHead, look_at
-from .examine import RULE, EpisodeLook, examine, median_period
+from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
 from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
@@ -252,7 +252,7 @@ def _resampling(
     population: Population, source: Path, looks: Sequence[EpisodeLook]
 ) -> tuple[tuple[dict[str, Any], ...], list[str]]:
     """Return the step that brings uneven time to one period, and a sentence about it; nothing where time is even."""
-    median, worst = median_period(looks), max(looks, key=lambda s: s.uneven)
+    median, worst = float(np.median([s.period_s for s in looks])), max(looks, key=lambda s: s.uneven)
     period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
     if not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks):
         return (), []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,11 +48,6 @@ def examine(population: Population, work: Work | None = None) -> list[EpisodeLoo
     looks = [look for group in (work or Work()).map("look", _look, tasks) for look in group]
     copies = dict(copies_among((s.key, s.digest) for s in looks if s.digest and not s.wrong))
     return [replace(s, wrong=f"a copy of {copies[s.key]}") if s.key in copies else s for s in looks]
-
-
-def median_period(looks: Sequence[EpisodeLook]) -> float:
-    """Return the median of the sampling periods of usable episodes, s."""
-    return float(np.median([s.period_s for s in looks if not s.wrong] or [np.nan]))
 
 
 def _look(population: Population) -> list[EpisodeLook]:

@@ -60,13 +60,6 @@ class UnitMapping(Settings):
     columns: dict[str, Column] = Field({}, description="column by channel, where it is not that of `[[channel]]`")
 
 
-class Trigger(Settings):
-    """``trigger``: every stretch of rows in which a column is above a threshold is an episode."""
-
-    column: Column = Field(description="name in the header or number from 1")
-    above: float = Field(description="threshold, in the column's unit")
-
-
 class CsvMapping(Settings):
     r"""How a folder of tables maps to a population; a file that does not match `files` is left alone."""
 
@@ -99,9 +92,12 @@ class CsvMapping(Settings):
     labels: dict[Literal["unit", "condition", "episode"], Column] = Field(
         {}, description='columns that state of every row what it belongs to, for example `{unit = "serial"}`'
     )
-    trigger: Trigger | None = Field(
+    trigger: Column | None = Field(
         None,
-        description="every stretch of rows in which a column is above a threshold is an episode, `<episode>.1` ...",
+        description="every stretch of rows in which this column is above `threshold` is an episode, `<episode>.1` ...",
+    )
+    threshold: float = Field(
+        0.5, description="of the trigger, in the column's unit; the default is for a flag of 0 and 1"
     )
     prepare: tuple[dict[str, Any] | Step, ...] = Field((), description="preparation steps of this mapping")
     metadata: dict[str, Any] = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
@@ -156,8 +152,8 @@ class CsvMapping(Settings):
     @property
     def declared(self) -> tuple[Column | None, ...]:
         """All columns that it names; of time none where there is no such column."""
-        labels = (*self.labels.values(), *([self.trigger.column] if self.trigger else []))
-        return (self.time, *labels, *(self.column(c, u) for u in self.units for c in self.channel))
+        columns = (self.column(c, u) for u in self.units for c in self.channel)
+        return (self.time, self.trigger, *self.labels.values(), *columns)
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
@@ -338,8 +334,8 @@ def _stretches(
         return
     columns = [read_labels(path, fields, _position(path, fields, c), mapping.dialect) for c in labels.values()]
     if trigger is not None:
-        (values,) = read_blocks(path, fields, [_position(path, fields, trigger.column)], mapping.dialect)
-        columns.append((values[:, 0] > trigger.above).tolist())
+        (values,) = read_blocks(path, fields, [_position(path, fields, trigger)], mapping.dialect)
+        columns.append((values[:, 0] > mapping.threshold).tolist())
     start, counts = 0, Counter[Any]()
     for state, rows in groupby(zip(*columns, strict=True)):
         start, first = start + sum(1 for _ in rows), start
@@ -348,8 +344,8 @@ def _stretches(
             number = "" if trigger is None else f".{counts[state]}"
             yield dict(zip(labels, state, strict=False)), number, (first, start)
     if trigger is not None and not any(state[-1] for state in counts):
-        problem = f"column {trigger.column!r} is nowhere above {trigger.above:g}"
-        raise DataError(f"Reading {path}: {problem}; lower the threshold of the trigger, or exclude the file.")
+        problem = f"column {trigger!r} is nowhere above {mapping.threshold:g}"
+        raise DataError(f"Reading {path}: {problem}; lower the threshold, or exclude the file.")
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:

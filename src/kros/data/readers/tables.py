@@ -115,7 +115,9 @@ def read_blocks(
         yield values_of(path, [fields[i] for i in wanted])
         return
     waiting = [np.empty((0, len(wanted)))]
-    for part in _parts(path, fields, wanted, dialect, timestamp):
+    for columns in _batches(path, fields, wanted, dialect, () if timestamp is None else wanted[:1]):
+        first = [] if timestamp is None else [microseconds(columns.pop(0), timestamp)]
+        part = np.column_stack([*first, *map(to_numpy, columns)])
         if len(part) > 1 and sum(map(len, waiting)) >= rows:
             yield np.concatenate(waiting)
             waiting = []
@@ -127,17 +129,8 @@ def read_labels(path: Path, fields: Sequence[str], column: int, dialect: Dialect
     """Return a column as text."""
     if is_binary(path):
         return [f"{value:g}" for value in values_of(path, [fields[column]])[:, 0]]
-    batches = _batches(path, fields, [column], dialect, {column})
+    batches = _batches(path, fields, [column], dialect, [column])
     return [str(text).strip() for (labels,) in batches for text in labels.to_pylist()]
-
-
-def _parts(
-    path: Path, fields: Sequence[str], wanted: Sequence[int], dialect: Dialect, timestamp: str | None
-) -> Iterator[Array]:
-    """Yield columns of a table as Arrow cuts it."""
-    for columns in _batches(path, fields, wanted, dialect, set() if timestamp is None else {wanted[0]}):
-        first = [] if timestamp is None else [microseconds(columns.pop(0), timestamp)]
-        yield np.column_stack([*first, *map(to_numpy, columns)])
 
 
 def _batches(

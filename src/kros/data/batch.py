@@ -11,10 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
-from .population import EpisodeKey, Population
+from .population import Array, EpisodeKey, Population
 from .recording import some
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

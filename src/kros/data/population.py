@@ -20,6 +20,7 @@ import numpy.typing as npt
 from ..core.errors import DataError
 from ..core.settings import member
 
+Array = npt.NDArray[np.float64]
 DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
 
@@ -249,22 +250,22 @@ class Population:
             return tuple(self.episodes[i] for i in self._positions.get((unit, condition), ()))
         return tuple(e for e in self.episodes if unit in (None, e.unit) and condition in (None, e.condition))
 
-    def read(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
+    def read(self, key: EpisodeKey) -> Array:
         """Read one episode, shape (n_samples, n_channels)."""
         return self.read_with_truths(key)[0]
 
-    def read_with_truths(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def read_with_truths(self, key: EpisodeKey) -> tuple[Array, Array]:
         """Read one episode, shape (n_samples, n_channels), and what its states really were, (n_samples, n_truths)."""
         values, n = self.source(key), len(self.channels)
         channels = np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values
         return channels, values[:, n : n + len(self.truths)]
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
         """Read one episode in blocks of at most `rows` samples, each of shape (n, n_channels), in as little memory."""
         for values in self.source.blocks(key, rows):
             yield values[:, : len(self.channels)]
 
-    def read_parts(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def read_parts(self, key: EpisodeKey) -> tuple[Array, Array]:
         """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""
         values = self.read(key)
         n = len(self.states)

@@ -8,13 +8,13 @@ from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import ValidationError
 
 from ..core.artifacts import digest_of, united
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened, stamp_of
 from .population import (
+    Array,
     Channel,
     EpisodeKey,
     Population,
@@ -50,7 +50,7 @@ class PreparedSource:
     steps: tuple[Step, ...] = ()
     gaps: bool = False  # whether samples may be missing; see `with_gaps`
 
-    def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
+    def __call__(self, key: EpisodeKey) -> Array:
         """Return one prepared episode, shape (n_samples, n_channels)."""
         recording = self.recordings(key)
         self._check_time(recording)
@@ -64,7 +64,7 @@ class PreparedSource:
             file = self.recordings.file(self.recordings.places[recording.key])
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
 
-    def _prepared(self, recording: Recording) -> tuple[npt.NDArray[np.float64], tuple[Channel, ...]]:
+    def _prepared(self, recording: Recording) -> tuple[Array, tuple[Channel, ...]]:
         """Return what steps make of an episode, or of a part of it, and the channels."""
         signals = Signals(self.channels, self.period_s)
         for step in self.steps:
@@ -72,14 +72,14 @@ class PreparedSource:
             signals = step.describe(signals)
         return recording.values, signals.channels
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
         """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
         if all(step.samplewise for step in self.steps):
             return checked_blocks(self._in_turn(self.recordings.blocks(key, rows)), key, self.channels, gaps=self.gaps)
         values = self(key)
         return (values[k : k + rows] for k in range(0, len(values), rows))
 
-    def _in_turn(self, blocks: Iterable[Recording]) -> Iterator[npt.NDArray[np.float64]]:
+    def _in_turn(self, blocks: Iterable[Recording]) -> Iterator[Array]:
         """Yield blocks of an episode after their steps; time is checked from the sample before on."""
         end = np.empty(0)
         for block in blocks:

@@ -22,9 +22,7 @@ from ..core import limits
 from ..core.errors import DataError
 from ..core.files import shortened
 from ..core.rounding import AGREED, ROUNDING
-from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
-
-Float = npt.NDArray[np.float64]
+from .population import OUTLIERS, Array, Channel, EpisodeKey, Population, Role
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,8 @@ class Recording:
     """One episode before or between preparation steps."""
 
     key: EpisodeKey
-    values: Float  # shape (n_samples, n_channels)
-    time_s: Float | None = None  # shape (n_samples,), s; None where the samples are known to be even
+    values: Array  # shape (n_samples, n_channels)
+    time_s: Array | None = None  # shape (n_samples,), s; None where the samples are known to be even
 
     def cut(self, start: int, stop: int) -> Recording:
         """Return samples `start` to `stop - 1`."""
@@ -95,7 +93,7 @@ class Recordings:
         return replace(self, places={key: self.places[key] for key in keys})
 
 
-def usable(values: Float) -> npt.NDArray[np.bool_]:
+def usable(values: Array) -> npt.NDArray[np.bool_]:
     """Tell which samples are numbers of a size that can be computed with."""
     return np.asarray(np.abs(values) <= limits.MAX_VALUE)
 
@@ -164,7 +162,6 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, whe
 
 
 logger = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 
 
 class NonFiniteError(DataError):

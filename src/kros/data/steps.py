@@ -27,20 +27,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import ConfigDict
 
 from ..core import limits
 from ..core.errors import ConfigError, DataError
 from ..core.files import did_you_mean
 from ..core.removed import refusing
-from .population import Channel, Role, Scalings, scaling_of
+from .population import Array, Channel, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim"]
 __getattr__ = refusing(__name__)
 
-Float = npt.NDArray[np.float64]
 GAP = 10.0  # median steps of time that a straight line bridges
 Channels = tuple[Channel, ...]
 
@@ -285,7 +283,7 @@ class Resample(Step):
             raise DataError(f"{what} to period_s = {self.period_s:g} {make}; correct the period.")
         return replace(recording, values=self.on_grid(time, timed.values, median), time_s=None)
 
-    def on_grid(self, time_s: Float, values: Float, median_s: float) -> Float:
+    def on_grid(self, time_s: Array, values: Array, median_s: float) -> Array:
         """Return samples at increasing times on an even grid from the first time on, shape (n_new, n_channels)."""
         finer = math.ceil(self.period_s / median_s - 1e-3)
         step = self.period_s / finer
@@ -331,7 +329,7 @@ def _n_states(channels: Channels) -> int:
     return sum(c.role is Role.STATE for c in channels)
 
 
-def lowpass(values: Float, cutoff: float) -> Float:
+def lowpass(values: Array, cutoff: float) -> Array:
     """Filter columns without delay by a windowed sinc; ends are extended by odd reflection."""
     half = min(math.ceil(4 / cutoff), len(values) - 1) if cutoff > 0 else 0
     if cutoff >= 0.5 or half < 1:

@@ -16,9 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.rounding import ITERATED
-from ..data.population import EpisodeKey
+from ..data.population import Array, EpisodeKey
 
-Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
 

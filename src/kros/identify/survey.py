@@ -14,19 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..core.artifacts import file_digest, load_artifact, loader, united
 from ..core.errors import DataError
 from ..core.files import is_file, link_or_copy
 from ..core.work import Work
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
+from ..data.population import DEFAULT_CONDITION, OUTLIERS, Array, EpisodeKey, Population, split_episodes
 from ..data.prepare import recording_marks
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..data.recording import CHECK, check_population, refuse_copies, some, title, usable_episodes
 from .flat_tops import Ends, FoundLimit, ends_of, found_limit, smallest_step
-
-Array = npt.NDArray[np.float64]
 
 
 def period_alerts(period_s: float) -> tuple[str, ...]:

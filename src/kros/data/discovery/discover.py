@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core.errors import ConfigError, DataError
 from ...core.files import did_you_mean
 from ...core.work import Work
 from ..measures import split_header
-from ..population import EpisodeKey, Population
+from ..population import Array, EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder
 from ..readers.tables import Dialect, file_fields, read_blocks
 from ..recording import CHECK, some, usable
@@ -30,7 +29,6 @@ from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
 from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
-Array = npt.NDArray[np.float64]
 _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
 
 

@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
-import numpy.typing as npt
 
 from ..measures import Measure, clean_unit, measure, split_header
+from ..population import Array
 from ..recording import CHECK
 
-Array = npt.NDArray[np.float64]
 WORDS = {
     "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl ref reference "
     "sollgeschwindigkeit consigne con ctrl control input inputs pwm duty stell stellgroesse stellwert feedforward "

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.files import shortened
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
+from ..population import DEFAULT_CONDITION, Array, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_period, title
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

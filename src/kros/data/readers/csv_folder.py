@@ -14,14 +14,23 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from ...core.errors import DataError
 from ...core.files import did_you_mean, read_toml
 from ...core.settings import Settings
 from ..measures import clean_unit, measure, split_header
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
+from ..population import (
+    DEFAULT_CONDITION,
+    Array,
+    Channel,
+    EpisodeKey,
+    Population,
+    Role,
+    Scaling,
+    Unit,
+    columns_in_order,
+)
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import Scale, Step
@@ -210,7 +219,6 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
 
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", *FORMATS)
 DEFAULT_UNIT = "unit"
 DEFAULT_EPISODE = "0"

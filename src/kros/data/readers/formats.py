@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core import limits
 from ...core.errors import DataError, MissingDependencyError
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of
+from ..population import Array
 from ..recording import some
 
-Array = npt.NDArray[np.float64]
 Group = tuple[Mapping[str, Any], Mapping[str, str]]
 
 

@@ -21,17 +21,15 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core.artifacts import load_artifact, save_artifact, united
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
-from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
+from ..population import Array, Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_structure, refuse_copies, usable_episodes
 from .tables import BLOCK, from_numpy, repeated, to_numpy
 
-Array = npt.NDArray[np.float64]
 Place = tuple[str, int, int]
 Episodes = Iterable[tuple[EpisodeKey, Array, str]]  # usable ones, with their samples and digests
 INDEX = "population"  # kind of the artifact, hence population.json

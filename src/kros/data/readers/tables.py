@@ -20,9 +20,9 @@ from ...core import limits
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened
 from ..measures import clean_unit, is_unit_row, split_header
+from ..population import Array
 from .formats import columns_of, is_binary, values_of
 
-Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
 ABSENT = ("-", "--", "---", *["#DIV/0!", "#NUM!", "#REF!", "#VALUE!", "#WERT!", "#ZAHL!", "#BEZUG!", "#NV"])
 BLOCK = 4 << 20  # bytes that Arrow parses at once; a line has to fit into two

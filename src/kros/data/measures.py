@@ -39,7 +39,7 @@ def _pairs(table: str) -> dict[str, str]:
     return {name: text for row in re.split(r"[|\n]", table.strip()) for name, _, text in [row.rpartition(" ")]}
 
 
-_KINDS = _pairs(_SI)
+KINDS = _pairs(_SI)
 _PINT = _pairs(_SPELLED)
 
 
@@ -50,11 +50,6 @@ class Measure:
     si: str
     factor: float
     offset: float
-
-    @property
-    def kind(self) -> str:
-        """Kind of quantity."""
-        return _KINDS[self.si]
 
     def into(self, other: Measure) -> tuple[float, float]:
         """Return factor and offset from this unit to another one of the same quantity."""
@@ -82,7 +77,7 @@ def _registry() -> tuple[Any, dict[Any, str]]:
     import pint
 
     registry: Any = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
-    return registry, {_in_base(registry, 1, name).units: name for name in _KINDS}
+    return registry, {_in_base(registry, 1, name).units: name for name in KINDS}
 
 
 def _in_base(registry: Any, value: float, unit: str) -> Any:

@@ -13,7 +13,7 @@ from enum import Enum
 
 import numpy as np
 
-from ..measures import Measure, clean_unit, measure, split_header
+from ..measures import KINDS, Measure, clean_unit, measure, split_header
 from ..population import Array
 from ..recording import CHECK
 
@@ -107,8 +107,9 @@ def _kinds_of(name: str) -> list[str]:
 def kind_of(name: str, unit: str = "") -> str:
     """Return the kind of quantity that a channel is, by its unit of measure or its name, or nothing."""
     known = measure(unit)
-    quantities = (kind for kind in _kinds_of(name) if kind not in ("", "input", "spare"))
-    return next(quantities, "") if known is None or known.kind == "other" else known.kind
+    kind = "other" if known is None else KINDS[known.si]
+    quantities = (of for of in _kinds_of(name) if of not in ("", "input", "spare"))
+    return next(quantities, "") if kind == "other" else kind
 
 
 def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[int]:

@@ -52,6 +52,7 @@ def test_what_is_not_converted(text: str) -> None:
 
 def test_names_of_factors() -> None:
     assert [unit_of_factor(*f) for f in ((math.pi / 30, "rad/s"), (1e-3, "A"), (math.pi, "rad"))] == ["rpm", "mA", ""]
+    assert unit_of_factor(5 / 9, "K") == ""  # a degF has another zero
 
 
 N = 60

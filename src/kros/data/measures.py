@@ -108,8 +108,8 @@ def _measured(text: str) -> Measure | None:
 
 
 def unit_of_factor(factor: float, unit: str) -> str:
-    """Return the unit of measure that is so many of an SI unit; nothing where none is known."""
-    sizes = ((name, m) for name in _WORDS.split() if (m := measure(name)) is not None and m.si == unit)
+    """Return the unit of measure with the zero of an SI unit that is so many of it; nothing where none is known."""
+    sizes = ((name, m) for name in _WORDS.split() if (m := measure(name)) is not None and (m.si, m.offset) == (unit, 0))
     return next((name for name, m in sizes if math.isclose(m.factor, factor, rel_tol=AGREED)), "")
 
 

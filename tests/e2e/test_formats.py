@@ -181,7 +181,7 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, ending, extra):
         monkeypatch.setitem(sys.modules, name, None)
     path = tmp_path / f"a.{ending}"
     path.write_bytes(b"anything")
-    with pytest.raises(MissingDependencyError, match=rf"a\.{ending} : .*; pip install 'kros\[{extra}\]'"):
+    with pytest.raises(MissingDependencyError, match=rf"a\.{ending}: .*; pip install 'kros\[{extra}\]'"):
         columns_of(path)
 
 

@@ -8,13 +8,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, TypeAdapter, field_validator
+from pydantic import Field, field_validator
 
 from ..core.errors import ConfigError
 from ..core.files import read_toml, shortened
 from ..core.settings import Settings
-from ..data.readers.csv_folder import CsvMapping
-from ..data.steps import STEPS
+from ..data.readers.csv_folder import mapping_schema
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
 from ..observer import EstimatorSettings
@@ -183,15 +182,10 @@ def validate_config(
 
 def study_schema() -> dict[str, Any]:
     """Return the JSON schema of a study file, with the mapping of recordings and the preparation steps."""
-    schema, mapping = StudyConfig.model_json_schema(), CsvMapping.model_json_schema()
+    schema, mapping = StudyConfig.model_json_schema(), mapping_schema()
     schema["$defs"] |= {**mapping.pop("$defs"), "CsvMapping": mapping}
-    steps = {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()}
-    for name, step in steps.items():
-        step["properties"]["step"] = {"const": name}
-    data = schema["$defs"]["DataConfig"]["properties"]
-    data["csv"] = {"$ref": "#/$defs/CsvMapping"}
-    for properties in (data, mapping["properties"]):
-        properties["prepare"]["items"] = {"oneOf": list(steps.values())}
+    parts = {"csv": {"$ref": "#/$defs/CsvMapping"}, "prepare": mapping["properties"]["prepare"]}
+    schema["$defs"]["DataConfig"]["properties"] |= parts
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
 from ...core.errors import DataError
 from ...core.files import did_you_mean, read_toml
@@ -33,7 +33,7 @@ from ..population import (
 )
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
-from ..steps import Scale, Step
+from ..steps import STEPS, Scale, Step
 from .formats import FORMATS
 from .tables import TIMESTAMP_SCALE, Dialect, file_fields, read_blocks, read_labels
 
@@ -216,6 +216,16 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
     if isinstance(mapping, Mapping):
         return CsvMapping.of(mapping, "CSV mapping")
     return CsvMapping.of(read_toml(Path(mapping), "CSV mapping"), f"CSV mapping {mapping}")
+
+
+def mapping_schema() -> dict[str, Any]:
+    """Return the JSON schema of a mapping, with all preparation steps."""
+    schema = CsvMapping.model_json_schema()
+    steps = {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()}
+    for name, step in steps.items():
+        step["properties"]["step"] = {"const": name}
+    schema["properties"]["prepare"]["items"] = {"oneOf": list(steps.values())}
+    return schema
 
 
 log = logging.getLogger(__name__)

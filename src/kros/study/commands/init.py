@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
-import textwrap
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +14,7 @@ from ...core.errors import ConfigError, DataError
 from ...core.work import Progress, Work
 from ...data import Population
 from ...data.discovery.discover import Discovery, Wanted, discover
-from ...data.discovery.roles import ColumnPart, TableColumn
-from ...data.readers.csv_folder import CsvMapping
+from ...data.discovery.text import comment, key_lines, mapping_lines
 from ...data.readers.opening import detect_reader
 from ...data.recording import check_population
 from ...identify.survey import UNLOADED, survey
@@ -28,17 +25,17 @@ from ..stages.learning import FEWEST, open_source
 def study_text(source: Path, data: Mapping[str, Any], discovery: Discovery | None, findings: Sequence[str]) -> str:
     """Return a study as TOML."""
     written = f"Written by kros init from the recordings in {source.name}. It can be run as it is; edit any line."
-    lines = [f"#:schema ./{SCHEMA}", *_comment(written)]
+    lines = [f"#:schema ./{SCHEMA}", *comment(written)]
     if findings:
-        lines += ["#", "# What looks wrong:", *(line for text in findings for line in _comment(f"- {text}"))]
-    lines += ["", "[data]", *_keys({key: data[key] for key in ("source", "reader", "on_nan") if key in data})]
-    identify_on = _keys({"identify_on": data.get("identify_on", "...")})[0]
+        lines += ["#", "# What looks wrong:", *(line for text in findings for line in comment(f"- {text}"))]
+    lines += ["", "[data]", *key_lines({key: data[key] for key in ("source", "reader", "on_nan") if key in data})]
+    identify_on = key_lines({"identify_on": data.get("identify_on", "...")})[0]
     prefix = "" if "identify_on" in data else "# "
     lines += [f"{prefix}{identify_on}  # condition that models and observers are made from, where there are several"]
     lines += ['# exclude = ["..."]  # units that take no part']
-    lines += _mapping(discovery) if discovery is not None else []
+    lines += mapping_lines(discovery) if discovery is not None else []
     for step in data.get("prepare", ()):
-        lines += ["", "[[data.prepare]]", *_keys(step)]
+        lines += ["", "[[data.prepare]]", *key_lines(step)]
     lines += [
         "",
         "# Nonlinear terms that you know of, such as gravity or a gear's ratio; without any, models are linear.",
@@ -47,61 +44,8 @@ def study_text(source: Path, data: Mapping[str, Any], discovery: Discovery | Non
     return "\n".join(lines) + "\n"
 
 
-def _keys(table: Mapping[str, Any]) -> list[str]:
-    return [f"{key} = {_value(value)}" for key, value in table.items()]
-
-
-def _mapping(discovery: Discovery) -> Iterator[str]:
-    """Yield the lines of ``[data.csv]``."""
-    yield from ("", "[data.csv]")
-    for key, value in discovery.mapping.items():
-        if key != "channel":
-            yield from _comment(discovery.reading) if key == "files" else ()
-            known = "" if key == "files" else CsvMapping.model_fields[key].description or ""
-            yield _line(key, value, discovery.notes.get(key, known))
-    for column in discovery.columns:
-        if column.part is ColumnPart.LEFT_OUT:
-            yield from _comment(f"left out: column {column.reference!r} ({column.why})")
-    by_name = {c.name: c for c in discovery.columns}
-    for channel in discovery.mapping["channel"]:
-        yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))
-
-
-def _channel(table: Mapping[str, Any], column: TableColumn) -> Iterator[str]:
-    for key, value in table.items():
-        note = {"role": column.why, "measured": "available at run time", "scale": "to " + column.unit}.get(key, "")
-        yield _line(key, value, note)
-
-
-def _line(key: str, value: Any, note: str) -> str:
-    return f"{key} = {_value(value)}{f'  # {_one_line(note)}' if note else ''}"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        literal = "\\" in value and "'" not in value and value.isprintable()
-        return f"'{value}'" if literal else json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(_value(v) for v in value)}]"
-    return repr(value)
-
-
-def _one_line(text: str) -> str:
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
-def _comment(text: str) -> list[str]:
-    later = "#   " if text.startswith("- ") else "# "
-    indents: dict[str, Any] = {"initial_indent": "# ", "subsequent_indent": later}
-    return textwrap.wrap(_one_line(text), 118, break_on_hyphens=False, **indents)
-
-
-log = logging.getLogger(__name__)
 SCHEMA = "study.schema.json"  # which editors look up by the first line of a study
-_UNLOADED_WORDS = "unloaded noload leerlauf ohnelast unbelastet leer idle empty vide avide sanscharge"
-NO_LOAD = _UNLOADED_WORDS.split()
+NO_LOAD = "unloaded noload leerlauf ohnelast unbelastet leer idle empty vide avide sanscharge"
 
 
 def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> list[str]:
@@ -156,5 +100,5 @@ def _unloaded(population: Population) -> str | None:
     conditions = population.conditions
     if len(conditions) < 2 or UNLOADED in conditions:
         return None
-    named = [c for c in conditions if re.sub(r"[\W_]", "", c.lower()) in NO_LOAD]
+    named = [c for c in conditions if re.sub(r"[\W_]", "", c.lower()) in NO_LOAD.split()]
     return named[0] if named else max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))

@@ -56,7 +56,6 @@ class Baseline:
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
-    limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
@@ -69,8 +68,7 @@ class Baseline:
             values = {k: v[rows] for k, v in parameters.items()}
             some = samples.of(rows)
             parts.append(self.by_unit[unit].run(some.y, some.u, values))
-        estimate = np.concatenate(parts, axis=1)[:, np.argsort(np.concatenate(list(units.values())))]
-        return estimate if self.limits is None else np.clip(estimate, *self.limits)
+        return np.concatenate(parts, axis=1)[:, np.argsort(np.concatenate(list(units.values())))]
 
 
 def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Array) -> Baseline:

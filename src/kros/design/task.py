@@ -126,7 +126,6 @@ class DesignTask:
     training: TrainingSet
     recordings: TrainingSet
     covered: tuple[str, ...]
-    limits: tuple[Array, Array]  # of states, (n,) each, infinite where there is none
 
     def observer(self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None) -> Observer:
         """Return the observer of a synthesis, with the nominal model or another one."""
@@ -158,9 +157,8 @@ class DesignTask:
 
     @property
     def runtime(self) -> Runtime:
-        """What observers have to know of the machine: the delay of measurements, and limits that clip estimates."""
-        limits = self.limits if np.isfinite(self.limits).any() else (None, None)
-        return Runtime(delay_of(self.sensor), *limits)
+        """What observers have to know of the machine: the delay of measurements."""
+        return Runtime(delay_of(self.sensor))
 
     @property
     def selector(self) -> Array:

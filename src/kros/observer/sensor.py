@@ -1,4 +1,4 @@
-r"""What is declared of a machine's sensors, and the limits that recordings show.
+r"""What is declared of a machine's sensors.
 
 What arrives at sample k of a measured channel y is
 
@@ -19,7 +19,6 @@ from pydantic import Field
 
 from ..core.errors import ConfigError
 from ..core.settings import Settings
-from ..data.flat_tops import FoundLimit
 
 Array = npt.NDArray[np.float64]
 
@@ -86,11 +85,3 @@ def delay_of(sensor: Sensors) -> int:
 def in_units(sensor: Sensors, sizes: Mapping[str, float]) -> dict[str, Sensor]:
     """Return sensors of channels that are divided by sizes, by name; one that is not named stays as it is."""
     return {name: own.in_unit(sizes.get(name, 1.0)) for name, own in sensor.items()}
-
-
-def sides(limits: Mapping[str, FoundLimit], states: Sequence[str]) -> tuple[Array, Array]:
-    """Return lower and upper limits that states reached in recordings, infinite where there is none."""
-    ends = [(limits[name].lower, limits[name].upper) if name in limits else (None, None) for name in states]
-    known = np.array(ends, dtype=float)
-    lower, upper = np.where(np.isnan(known), [-np.inf, np.inf], known).T
-    return lower, upper

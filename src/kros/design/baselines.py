@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import ConfigError, DataError, SynthesisError
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
@@ -23,7 +23,6 @@ from ..observer.screen import Screen
 from ..observer.sensor import delay_of
 from .validation import TrainingSet, rank
 
-Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, Array]
 
 
@@ -42,7 +41,7 @@ DEFAULT = BaselineSettings()
 class Estimator(Protocol):
     """What can be run over a batch of episodes."""
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
         """Return estimates, shape (n_samples, batch, n)."""
 
 
@@ -139,7 +138,7 @@ class MeanProfile:
     inputs: Sequence[Array]  # (n_samples, m)
     states: Sequence[Array]  # (n_samples, h)
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
         """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest."""
         del parameters
         estimate, sizes = np.full((*y.shape[:2], self.n_states), np.nan), largest_of(self.inputs)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
 from ..core.rounding import TINY
@@ -35,7 +35,6 @@ from .task import Design, DesignTask
 from .validation import TRAINING, hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from itertools import zip_longest
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.rounding import TINY
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
@@ -22,7 +22,6 @@ from ..identify.identified import IdentifiedModels
 from ..observer import Observer, Seen
 from ..observer.sensor import Sensors, in_units
 
-Array = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 

@@ -16,13 +16,12 @@ from itertools import combinations_with_replacement
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationError, validate_call
 
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from .formula import MAX_DELAY, delayed_name
 
-Array = npt.NDArray[np.float64]
 Formulas = tuple[str, ...]
 T = TypeVar("T")
 MAX_FORMULAS = 100_000  # of one family

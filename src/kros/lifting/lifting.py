@@ -18,16 +18,15 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import ConfigError, DimensionError
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
 from .program import Program
 from .window import FormulaSeparation, Window
 
-Array = npt.NDArray[np.float64]
-Parameters = Mapping[str, npt.ArrayLike]
+Parameters = Mapping[str, ArrayLike]
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,7 @@ class Lifting:
         """Names of the lifted states."""
         return self.states + self.functions
 
-    def lift(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
+    def lift(self, x: ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the lifted states (..., n + p) of windows (..., n_window): of states alone where there are no delays.
 
         Values of parameters broadcast against ``x[..., 0]``.
@@ -165,7 +164,7 @@ class Lifting:
         """
         self._programs[0].fill(lifted, self._values(parameters, lifted, earlier), self.n_states)
 
-    def lift_inputs(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
+    def lift_inputs(self, u: ArrayLike, window: ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the inputs (..., m) with the input functions behind them, (..., m + r), on windows (..., n_window)."""
         u = np.asarray(u, dtype=float)
         self.window.require_inputs(u)
@@ -190,10 +189,10 @@ class Lifting:
 
     def slopes(
         self,
-        x: npt.ArrayLike,
+        x: ArrayLike,
         parameters: Parameters | None = None,
         names: tuple[str, ...] | None = None,
-        u: npt.ArrayLike | None = None,
+        u: ArrayLike | None = None,
     ) -> Array:
         """Return the derivative of the lifted functions, with inputs that of the input functions, on windows.
 
@@ -236,7 +235,7 @@ class Lifting:
     def _read(self) -> frozenset[str]:
         return frozenset(name for formula in self.formulas + self.input_formulas for name in formula.used)
 
-    def _windows(self, x: npt.ArrayLike) -> Array:
+    def _windows(self, x: ArrayLike) -> Array:
         x, names = np.asarray(x, dtype=float), self.window.names
         if x.shape[-1:] != (len(names),):
             raise DimensionError(f"Lifting: expected {len(names)} entries {names} last, found shape {x.shape}.")

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 
-Whole = npt.NDArray[np.int32]
+Codes = npt.NDArray[np.int32]
 Tree = tuple[Any, ...]
 _NUMPY = {"Abs": "abs", "atan": "arctan"}
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "Abs", "sign", "atan")
@@ -28,9 +29,9 @@ class Program:
     """Operations of some expressions; registers hold the quantities, then the constants, then results."""
 
     names: tuple[str, ...]  # quantities
-    constants: npt.NDArray[np.float64]  # shape (constants,)
-    code: Whole  # shape (operations, 4): kind, register of the result, registers of the two operands
-    outputs: Whole  # register of every expression
+    constants: Array  # shape (constants,)
+    code: Codes  # shape (operations, 4): kind, register of the result, registers of the two operands
+    outputs: Codes  # register of every expression
     registers: int
 
     @classmethod
@@ -48,7 +49,7 @@ class Program:
             registers[into] = function(*(registers[i] for i in operands))
         return [registers[i] for i in self.outputs]
 
-    def fill(self, out: npt.NDArray[np.float64], values: Mapping[str, Any], first: int = 0) -> None:
+    def fill(self, out: Array, values: Mapping[str, Any], first: int = 0) -> None:
         """Write the values of the expressions along the last axis, from one column on."""
         for column, value in enumerate(self.run(values), first):
             out[..., column] = value

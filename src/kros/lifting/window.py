@@ -16,14 +16,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Index
 from ..core.errors import ConfigError, DataError, DimensionError
 from .formula import MAX_TERMS, Formula, base_and_delay, count_terms, delayed_name
 from .program import Program
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -148,7 +145,7 @@ class FormulaSeparation:
         self._program.fill(out, self.window.values(window, u))
         return out
 
-    def matrix(self, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+    def matrix(self, parameters: Mapping[str, ArrayLike]) -> Array:
         """Return M(q) for parameter values of any common shape, shape (..., p, n_basis)."""
         values = {name: np.asarray(parameters[name], dtype=float) for name in self.parameters}
         shape = np.broadcast_shapes(*(v.shape for v in values.values()))

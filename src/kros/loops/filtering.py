@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from .library import library, linear_formulas
-
-Array = npt.NDArray[np.float64]
 
 
 def recursion(F: Array, driven: Array, first: Array, G: Array | None = None) -> Array:

@@ -12,8 +12,8 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import ArrayLike
 from ..core.errors import ConfigError
 from ..lifting import Lifting
 from .compiler import load
@@ -84,7 +84,7 @@ def library() -> Library | None:
 
 
 def formulas(
-    lifting: Lifting, tape: Tape, values: Mapping[str, npt.ArrayLike] | None, m: int, batch: int
+    lifting: Lifting, tape: Tape, values: Mapping[str, ArrayLike] | None, m: int, batch: int
 ) -> tuple[str, dict[str, Any]]:
     """Return what the loops need to know of a lifting with parameters of shape (batch,), and m recorded inputs."""
     window, given = lifting.window, lifting.parameter_values(values)

@@ -6,20 +6,20 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..lifting import Lifting
-from ..lifting.program import Program, Whole
+from ..lifting.program import Codes, Program
 
 
 @dataclass(frozen=True, eq=False)
 class Tape:
     """Operations of a lifting."""
 
-    constants: npt.NDArray[np.float64]  # shape (constants,)
-    code: Whole  # shape (operations, 4): kind, register of the result, registers of the operands
-    lifted: Whole  # shape (n_lifted + inputs,): registers of the lifted states, then of the inputs and their functions
-    slopes: Whole  # shape (slopes, 3): column of a model, entry, and register of every derivative that is not zero
+    constants: Array  # shape (constants,)
+    code: Codes  # shape (operations, 4): kind, register of the result, registers of the operands
+    lifted: Codes  # shape (n_lifted + inputs,): registers of the lifted states, then of the inputs and their functions
+    slopes: Codes  # shape (slopes, 3): column of a model, entry, and register of every derivative that is not zero
     registers: int
 
 

@@ -19,11 +19,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import DimensionError
-
-Array = npt.NDArray[np.float64]
 
 
 class LoadAndCurrent(NamedTuple):
@@ -53,7 +51,7 @@ class AngleLoad:
     limit: float = np.inf  # of the current
     trusted: float = 0.5  # most that a load at the limit differs from what the angle says, as a share of the limit
 
-    def run(self, seen: npt.ArrayLike, current: npt.ArrayLike, position: npt.ArrayLike) -> LoadAndCurrent:
+    def run(self, seen: ArrayLike, current: ArrayLike, position: ArrayLike) -> LoadAndCurrent:
         """Return loads and currents with their levels, for signals of shape (n_samples, batch).
 
         `seen` and `current` are the observer's load and current in the current's unit, `position` is measured in rad;
@@ -74,7 +72,7 @@ class AngleLoad:
         """What of a level is left after a sample."""
         return float(np.exp(-self.sample_period_s / self.level_s))
 
-    def start(self, position: npt.ArrayLike) -> RunningAngleLoad:
+    def start(self, position: ArrayLike) -> RunningAngleLoad:
         """Return the same sample by sample, for machines that start at angles in rad, shape (batch,)."""
         return RunningAngleLoad(self, np.atleast_1d(np.asarray(position, dtype=float)))
 

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import ConfigError, DimensionError
 from ..core.linalg import balanced_size
 from ..core.lti import StateSpace
@@ -33,8 +33,6 @@ from .filter_bank import FilterBank
 from .monitor import Monitor
 from .runtime import Guard, Runtime, Seen
 from .sensor import Sensors, require_measured
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +188,7 @@ class ObserverData:
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
     def initial(
-        self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None
+        self, y: ArrayLike, parameters: Mapping[str, ArrayLike] | None = None, u: ArrayLike | None = None
     ) -> Array:
         """Return the first estimate, (..., n): measurements, and others zero or as a bank starts."""
         first = np.asarray(y, dtype=float)
@@ -204,12 +202,12 @@ class ObserverData:
             x = np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
         return x
 
-    def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
+    def own(self, parameters: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
         """Return those parameters of many that the lifting has."""
         return {name: parameters[name] for name in self.lifting.parameters if name in parameters}
 
     def values(
-        self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None
+        self, parameters: Mapping[str, ArrayLike] | None = None, shape: tuple[int, ...] | None = None
     ) -> dict[str, Any]:
         """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`."""
         known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}

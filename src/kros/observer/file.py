@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import ConfigDict, Field, create_model
 
+from ..core.arrays import Array
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
 from ..core.errors import DataError, KrosError
 from ..core.files import shortened
@@ -29,7 +29,6 @@ from .monitor import Monitor
 from .runtime import Guard, Runtime, Seen
 from .sensor import Sensor
 
-Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
 SCHEMA, KIND = 3, "observer"
 Name = Annotated[str, Field(min_length=1)]

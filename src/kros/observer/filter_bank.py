@@ -27,13 +27,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Flags
 from ..core.errors import DataError
 from ..core.linalg import floats
 from ..core.rounding import ITERATED
 
-Array = npt.NDArray[np.float64]
 _FORGOTTEN = ITERATED  # samples: an age whose square counts as nothing beside any half
 _ARRAYS = ("start", "forget", "half", "recovery", "reach")
 
@@ -95,7 +94,7 @@ class Gaps:
         for values in (self.offset, self.age, self.ramp, self.count):
             values[rows] = 0.0
 
-    def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> None:
+    def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
         if not missing.any() and not self.count.any():
             x[:, self.measured] = y
@@ -117,7 +116,7 @@ class Gaps:
         fallback, share = x[:, self.fallback], self.hidden * self.bank.level(self.age)
         return self.bank.forget * (last - fallback + share * (self.offset - last + fallback))
 
-    def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
+    def follow(self, x: Array, following: Array, missing: Flags, moving: Any = slice(None)) -> None:
         """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""
         bank, some = self.bank, np.asarray(missing.any(axis=1))
         offset = self.apart(x, np.where(missing, self.held, x[:, self.measured]))

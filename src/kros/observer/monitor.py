@@ -23,13 +23,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, Array, Flags
 from ..core.errors import DataError
 from ..core.linalg import floats
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 LARGEST = 1e3  # sizes of the innovation that count at most
 RECOVERY = 4  # samples that are not judged after one that is not good
 WEIGHT = 16  # of all bands together
@@ -123,7 +121,7 @@ def octaves(count: int = 6, quality: float = 1.4) -> Array:
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
 
 
-def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
+def judged_samples(settle: int, status: AnyArray, starts: Flags, moving: Flags) -> Flags:
     """Return which samples are judged, as a running observer does it; status and flags (n_samples, batch)."""
     judged, wait = np.zeros(status.shape, dtype=bool), np.zeros(status.shape[1], dtype=int)
     for k in range(len(status)):

@@ -7,12 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import DataError
 from ..core.linalg import floats
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,14 +29,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Flags, Index
 from ..core.errors import DimensionError
 from .data import ObserverData
 from .runtime import Seen
 
-Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.uint8]
-Whole = npt.NDArray[np.intp]
-Flags = npt.NDArray[np.bool_]
 BEYOND = 1.5  # times the range: what is further away is implausible
 _SIGNALS = ("y", "u", "status", "starts", "complete")
 LONGEST = 5  # samples for which an input may be held without a new start
@@ -82,7 +80,7 @@ class Held:
     """Inputs held from sample to sample."""
 
     inputs: Array  # (batch, m)
-    since: Whole  # (batch, m)
+    since: Index  # (batch, m)
     stale: Flags  # (batch,)
 
     @classmethod
@@ -102,7 +100,7 @@ class Screened:
     complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
 
-    def of(self, members: Sequence[int] | Whole) -> Screened:
+    def of(self, members: Sequence[int] | Index) -> Screened:
         """Return the samples of some members of the batch."""
         held = Held(*(value[members] for value in vars(self.held).values()))
         return replace(self.each(lambda name: getattr(self, name)[:, members]), held=held)
@@ -180,7 +178,7 @@ class Screen:
         return Screened(y, inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))
 
 
-def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike, held: Held | None = None) -> Screened:
+def screened(observer: ObserverData, y: ArrayLike, u: ArrayLike, held: Held | None = None) -> Screened:
     """Return a batch of samples as an observer takes them; `held` is known before the first."""
     y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
     require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)

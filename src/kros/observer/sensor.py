@@ -14,14 +14,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from ..core.settings import Settings
 from ..data.flat_tops import FoundLimit
-
-Array = npt.NDArray[np.float64]
 
 
 class Sensor(Settings):

@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Flags, Index
 from ..loops import Library, formulas, library, tape_of
 from .data import ObserverData
 from .monitor import judged_samples
 from .runtime import bounds
-from .screen import Bits, Flags, Held, SampleStatus, Screened, Whole, screened
+from .screen import Bits, Held, SampleStatus, Screened, screened
 from .step import Parameters, Steps, forward
 
-Array = npt.NDArray[np.float64]
 _ROWS = 1000  # samples predicted forward at a time
 
 
@@ -24,7 +23,7 @@ def run_observer(
     observer: ObserverData,
     y: Array,
     u: Array,
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    parameters: Mapping[str, ArrayLike] | None = None,
 ) -> Array:
     """Run an observer over a batch of episodes.
 
@@ -68,7 +67,7 @@ def run_observer(
 
 
 def run_observers(
-    observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+    observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None
 ) -> Array:
     """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
     samples = screened(observers[0], y, u)
@@ -77,7 +76,7 @@ def run_observers(
 
 
 def run_innovations(
-    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None, settle: int = 0
+    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None, settle: int = 0
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
     run = Course(observer, y.shape[1], parameters).take(y, u)
@@ -212,7 +211,7 @@ def stepped(course: Course, samples: Screened) -> Stepped:
 
 
 def _predict(
-    observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Mapping[str, Array]
+    observer: ObserverData, x: Array, earlier: Array, pending: Index, samples: Screened, values: Mapping[str, Array]
 ) -> None:
     """Predict states (n_samples, batch, n) to their rows, without correction."""
     batch = x.shape[1]

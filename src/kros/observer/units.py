@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import DataError
 from ..core.files import shortened
 from ..core.lti import StateSpace
@@ -23,7 +23,6 @@ from ..synthesis.result import Injection
 from .data import ObserverData
 from .sensor import in_units
 
-Array = npt.NDArray[np.float64]
 O = TypeVar("O", bound=ObserverData)  # noqa: E741
 
 
@@ -100,7 +99,7 @@ def recorded_channel(observer: ObserverData, name: str) -> RecordedChannel:
     return RecordedChannel(factor, unit_of_factor(factor, unit) or f"{factor:.6g} {unit or 'of the study'}", note)
 
 
-def recorded_factors(observer: ObserverData, names: Sequence[str]) -> npt.NDArray[np.float64]:
+def recorded_factors(observer: ObserverData, names: Sequence[str]) -> Array:
     """Return the factor of every channel: its value is the factor times the recorded one."""
     return np.array([recorded_channel(observer, name).factor for name in names])
 

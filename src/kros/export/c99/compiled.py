@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array
 from ...core.errors import ConfigError, DimensionError
 from ...loops.compiler import COMPILERS, compile_library, find_compiler
 
-Array = npt.NDArray[np.float64]
 Machine = npt.NDArray[np.uint8]  # the state of one machine, as the C source keeps it
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")
 # The loop over time, compiled beside the observer: what arrives and leaves lies sample after sample.
@@ -95,7 +95,7 @@ class CompiledObserver:
 
     def run(
         self, y: Array, u: Array, parameters: Mapping[str, float] | None = None, machine: Machine | None = None
-    ) -> tuple[Array, npt.NDArray[Any]]:
+    ) -> tuple[Array, AnyArray]:
         """Estimate one recording, sample by sample.
 
         Parameters
@@ -135,5 +135,5 @@ def _wide(manifest: Mapping[str, Any]) -> str:
     return "_wide" if manifest["precision"] == "float" else ""
 
 
-def _at(array: npt.NDArray[Any]) -> ctypes.c_void_p:
+def _at(array: AnyArray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.errors import ConfigError
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
@@ -23,7 +23,6 @@ from ..text import plain, plain_names
 from .origin import OriginShift, find_shift
 from .realise import RULE, realised
 
-Array = npt.NDArray[np.float64]
 DOUBLE, SINGLE = Precision(), Precision("float")
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array
 from ...core.artifacts import json_bytes, with_checksum
 from ...core.errors import ConfigError
 from ...core.files import whole_folder, write_bytes
@@ -163,9 +164,6 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     return -(-(8 * doubles + real * reals + 4 * words) // align) * align
 
 
-Array = npt.NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False)
 class Golden:
     """Samples and what becomes of them."""
@@ -173,11 +171,11 @@ class Golden:
     y: Array  # (n_samples, q)
     u: Array  # (n_samples, m)
     x_hat: Array  # (n_samples, n_recorded)
-    status: npt.NDArray[Any]  # (n_samples,)
+    status: AnyArray  # (n_samples,)
     passes: int
-    last_status: npt.NDArray[Any]  # (n_samples,)
+    last_status: AnyArray  # (n_samples,)
     # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
-    sure: npt.NDArray[Any]
+    sure: AnyArray
 
     @classmethod
     def of(cls, observer: Observer, track: str | None = None, count: int = 60, tolerance: float = 0.0) -> Golden:

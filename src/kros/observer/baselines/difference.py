@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, ArrayLike
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class FilteredDifference:
     sample_period_s: float
     scales: tuple[float, ...] = ()  # of every pair: the state over the rate, which units of measure decide; one
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
         """Estimate the rates from y (n_samples, batch, q), from rest; (n_samples, batch, n), NaN for other states."""
         from scipy.signal import butter, lfilter
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.errors import SynthesisError
 from ...core.rounding import TINY
 from ...synthesis import kalman
 from ...synthesis.result import Synthesis
-
-Array = npt.NDArray[np.float64]
 
 
 def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:

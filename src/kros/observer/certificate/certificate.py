@@ -15,15 +15,13 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.artifacts import Storable
 from ..data import ObserverData
 from ..units import factors
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
 from .proof import first_proof, frozen_gain, growing_place
-
-Array = npt.NDArray[np.float64]
 
 
 class ReliftStatus(str, Enum):

@@ -19,8 +19,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, ArrayLike, Flags, Whole
 from ...core.rounding import AGREED, TINY
 from ...data import EpisodeBatch
 from ...loops.filtering import recursion
@@ -32,7 +32,6 @@ from .certificate import ReliftCertificate
 from .error import ErrorSystem, ReliftScales
 from .proof import proven_gain
 
-Array = npt.NDArray[np.float64]
 _OTHERS = (0.0, 1e-3)  # weights of other states' errors: with them the Riccati equation is better conditioned
 
 
@@ -85,7 +84,7 @@ class SignalBound:
             "set_outside": list(self.outside),
         }
 
-    def in_sizes(self, factors: npt.ArrayLike) -> SignalBound:
+    def in_sizes(self, factors: ArrayLike) -> SignalBound:
         """Return the same for states in other units of measure, by their factors, shape (n,)."""
         by = np.asarray(factors, dtype=float)
         return replace(self, **{name: getattr(self, name) * by for name in ("bounds", "errors", "sizes")})
@@ -149,7 +148,7 @@ class Course:
     noise: Array  # (n_samples - 1, batch, q): what the sensor shows beside the recording, as it arrives
     first: Array  # (batch, n_window): first error, with the earlier ones that the lifting reads, which equal it
     error: Array  # (n_samples, batch, n)
-    lengths: npt.NDArray[np.int64]  # (batch,)
+    lengths: Whole  # (batch,)
     inputs: Array  # (n_samples, batch, m)
     y: Array  # (n_samples, batch, q): measurements as they arrive
     beyond: Array  # (n_samples, batch, n_recorded): what recorded states are beyond declared limits, by noise
@@ -159,7 +158,7 @@ class Course:
         inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
         return np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None]
 
-    def taken(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
+    def taken(self, observer: ObserverData) -> Flags:
         """Whether the observer takes all samples, shape (batch,)."""
         samples = screened(observer, self.y, self.inputs)
         good = np.isfinite(samples.y).all(axis=-1) & (samples.u == self.inputs).all(axis=-1)
@@ -183,9 +182,7 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     return Course(omega, noise, first, states - estimates, batch.lengths, inputs, y, batch.states - states)
 
 
-def held_residual(
-    observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike]
-) -> Array:
+def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, ArrayLike]) -> Array:
     """Return the one-step residual, shape (n_samples - 1, batch, n); values before the first sample equal it."""
     h = observer.lifting.history
     if h:

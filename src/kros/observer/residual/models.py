@@ -17,11 +17,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array
 from ...core.errors import DataError
 from ...core.rounding import TINY
 from ...data import EpisodeBatch
@@ -29,7 +28,6 @@ from ...lifting import Lifting
 from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, promised_errors
 from .one_step import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 
-Array = npt.NDArray[np.float64]
 _MOST_HIDDEN = 3  # beyond it, all hidden states or none are refitted
 _THIN = 3
 
@@ -42,7 +40,7 @@ class ResidualModel:
     A: Array  # (n_lifted, n_lifted)
     B: Array  # (n_lifted, m)
     dynamics: Array  # (n, n)
-    spectra: npt.NDArray[Any]  # (unit, f, n, n)
+    spectra: AnyArray  # (unit, f, n, n)
     promised: Array  # (n,)
 
 

@@ -18,12 +18,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, ArrayLike
 from ...core.errors import DataError
 from ...lifting import Lifting
 
-Array = npt.NDArray[np.float64]
 SEGMENT = 4096
 FEWEST_SAMPLES = 64  # samples of a segment
 
@@ -34,7 +33,7 @@ def one_step_residual(
     B: Array,
     states: Array,
     inputs: Array,
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    parameters: Mapping[str, ArrayLike] | None = None,
 ) -> Array:
     """Run the one-step model along recordings and return what it misses; A (n_lifted, n_lifted), B (n_lifted, m)."""
     n, h = lifting.n_states, lifting.history
@@ -47,7 +46,7 @@ def one_step_residual(
 
 
 def mean_slopes(
-    lifting: Lifting, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+    lifting: Lifting, states: Array, inputs: Array, parameters: Mapping[str, ArrayLike] | None = None
 ) -> Array:
     """Return the lifted functions' slopes by the states at their mean over recordings, shape (p, n)."""
     n = lifting.n_states
@@ -64,13 +63,13 @@ def mean_error_dynamics(A: Array, slopes: Array) -> Array:
     return np.asarray(A[:n, :n] + A[:n, n:] @ slopes)
 
 
-def one_step_covariance(residual: Array, lengths: npt.ArrayLike) -> Array:
+def one_step_covariance(residual: Array, lengths: ArrayLike) -> Array:
     """Return the mean product of residuals (n_samples, batch, n) over all episodes, shape (n, n)."""
     counted = residual[np.arange(len(residual))[:, None] < np.asarray(lengths)]
     return np.asarray(counted.T @ counted / len(counted))
 
 
-def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[str], segment: int = SEGMENT) -> Array:
+def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], segment: int = SEGMENT) -> Array:
     """Return every unit's cross spectral density of the residual by Welch's method, means included."""
     lengths = np.asarray(lengths, dtype=int)
     size = int(min(segment, lengths.min(), len(residual)))

@@ -328,7 +328,6 @@ def test_baselines_judge_samples_as_observers_do():
         o.A,
         o.B,
         (0,),
-        ("a", "b"),
         1e-4 * np.eye(2),
         np.array([[1e-4]]),
         start_covariance(np.ones(2), np.array([[1e-4]]), (0,)),

@@ -64,8 +64,7 @@ class Baseline:
         samples, parts = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), list[Array]()
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
-            some = samples.of(rows)
-            parts.append(self.by_unit[unit].run(some.y, some.u, values))
+            parts.append(self.by_unit[unit].run(samples.y[:, rows], samples.u[:, rows], values))
         estimate = np.concatenate(parts, axis=1)[:, np.argsort(np.concatenate(list(units.values())))]
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
 
@@ -82,7 +81,6 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         models.A[row],
         models.B[row],
         models.measured,
-        models.recorded_inputs,
         np.stack([10**level * shape for level in DEFAULT.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),

@@ -22,6 +22,7 @@ typedef struct {
     whole registers;
     whole constants;
     whole operations;
+    whole slopes;
     const double *constant;   /* (constants) */
     const int32_t *code;      /* (operations, 4): what, into, from, from */
     const int32_t *lifted;    /* registers of [x; sigma] and of [u; gamma], in the order of a model's columns */
@@ -29,6 +30,7 @@ typedef struct {
     whole n_inputs;
     const int32_t *shift;     /* (earlier): register that every earlier value has at the next sample */
     const int32_t *present;   /* (earlier): register of the quantity itself */
+    const int32_t *slope;     /* (slopes, 3): column of a model, place among the entries asked for, register; none */
     const double *values;     /* (parameters, batch) */
 } formulas;
 
@@ -65,12 +67,10 @@ typedef struct {
     whole stride;
     whole terms;       /* n, and earlier values of states that move with the model */
     whole depth;       /* sensitivities that are kept: of now, and of so many samples before */
-    whole slopes;
     whole rows;        /* of J that are written for one state and machine */
     const double *W;          /* (n, p, batch) */
     const double *T;          /* (p, p) */
     const int32_t *term;      /* (terms, 2): state, samples ago */
-    const int32_t *slope;     /* (slopes, 3): column of W, term, register */
     const double *x;          /* (samples, n, batch) */
     const double *u;          /* (samples, m, batch) */
     const uint8_t *valid;     /* (samples, batch) */
@@ -299,8 +299,8 @@ int kros_sensitivities(const formulas *f, const sensitivity_job *s)
             for (whole a = 0; a < n; a++)
                 for (whole t = 0; t < terms; t++)
                     for (whole v = 0; v < w; v++) F[(a * terms + t) * MOST + v] = t < n ? W[(a * p + t) * MOST + v] : (vec){0};
-            for (whole i = 0; i < s->slopes; i++) {
-                const int32_t *of = s->slope + 3 * i;
+            for (whole i = 0; i < f->slopes; i++) {
+                const int32_t *of = f->slope + 3 * i;
                 for (whole a = 0; a < n; a++)
                     for (whole v = 0; v < w; v++) F[(a * terms + of[1]) * MOST + v] += W[(a * p + of[0]) * MOST + v] * reg[of[2] * MOST + v];
             }

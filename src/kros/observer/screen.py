@@ -21,7 +21,7 @@ and a start costs no more than a start. Parameters stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import Any
@@ -100,11 +100,6 @@ class Screened:
     complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
 
-    def of(self, members: Sequence[int] | Index) -> Screened:
-        """Return the samples of some members of the batch."""
-        held = Held(*(value[members] for value in vars(self.held).values()))
-        return replace(self.each(lambda name: getattr(self, name)[:, members]), held=held)
-
     def rows(self, part: slice) -> Screened:
         """Return some samples of all members."""
         return self.each(lambda name: getattr(self, name)[part])
@@ -116,16 +111,6 @@ class Screened:
     def each(self, signal: Callable[[str], Any]) -> Screened:
         """Return the same with other signals, by name."""
         return replace(self, **{name: signal(name) for name in _SIGNALS})
-
-
-def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:
-    """Refuse measurements and inputs that do not fit together, or to an observer."""
-    n_samples, batch = y.shape[:2] if y.ndim == 3 and len(y) else (1, 0)
-    if (y.shape, u.shape) != ((n_samples, batch, measured), (n_samples, batch, len(inputs))):
-        raise DimensionError(
-            f"Running {who}: expected {measured} measurements and the inputs {tuple(inputs)} on the last axes of y and "
-            f"u, (n_samples, batch, .), with at least one sample, found shapes {y.shape} and {u.shape}."
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +165,13 @@ class Screen:
 
 def screened(observer: ObserverData, y: ArrayLike, u: ArrayLike, held: Held | None = None) -> Screened:
     """Return a batch of samples as an observer takes them; `held` is known before the first."""
-    y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
-    require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)
+    y, u, q, inputs = np.asarray(y, float), np.asarray(u, float), len(observer.measured), observer.inputs
+    n_samples, batch = y.shape[:2] if y.ndim == 3 and len(y) else (1, 0)
+    if (y.shape, u.shape) != ((n_samples, batch, q), (n_samples, batch, len(inputs))):
+        raise DimensionError(
+            f"Running observer {observer.name}: expected {q} measurements and the inputs {tuple(inputs)} on the last "
+            f"axes of y and u, (n_samples, batch, .), with at least one sample, found shapes {y.shape} and {u.shape}."
+        )
     return Screen.of(observer).take(y, u, held)
 
 

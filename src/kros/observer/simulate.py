@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..core.arrays import Array, ArrayLike, Flags, Index
-from ..loops import Library, formulas, library, tape_of
+from ..loops import Library, formulas, library
 from .data import ObserverData
 from .monitor import judged_samples
 from .runtime import bounds
@@ -235,8 +235,8 @@ def _compiled(loops: Library, courses: Sequence[Course], samples: Screened) -> l
     states = np.empty((n_samples, len(courses), lifting.n_states, batch))
     states[:first] = [course.steps.x.T for course in courses]
     job = _job(courses, samples.rows(slice(first, None)), samples.u[first - delay : n_samples - delay])
-    tape = formulas(lifting, tape_of(lifting, samples.u.shape[2]), values, samples.u.shape[2], batch)
-    loops.call("kros_relift", tape, ("relift_job", job | {"states": states[first:]}))
+    of_lifting = formulas(lifting, values, samples.u.shape[2], batch)
+    loops.call("kros_relift", of_lifting, ("relift_job", job | {"states": states[first:]}))
     moving = np.broadcast_to(np.arange(lead, n_samples)[:, None] >= first, (n_samples - lead, batch))
     runs, n, nl = list[Stepped | None](), lifting.n_states, lifting.n_lifted
     for i, course in enumerate(courses):

@@ -24,7 +24,6 @@ import numpy as np
 from ...core.arrays import Array, ArrayLike
 from ...core.errors import DimensionError
 from ...lifting import Lifting
-from ..screen import require_samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,6 @@ class ExtendedKalman:
     A: Array  # (n_lifted, n_lifted)
     B: Array  # (n_lifted, m), with input functions
     measured: tuple[int, ...]
-    inputs: tuple[str, ...]
     Q: Array  # (n, n), process noise of the original states; or (k, n, n) for k filters at once
     R: Array  # (q, q), measurement noise
     P0: Array  # (n, n), of the first estimate
@@ -49,7 +47,6 @@ class ExtendedKalman:
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def run_all(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
-        require_samples("the extended Kalman filter", len(self.measured), self.inputs, y, u)
         lifting, n, C, (n_samples, batch) = self.lifting, self.lifting.n_states, list(self.measured), y.shape[:2]
         values = {**self.parameters, **(parameters or {})}
         if self.delay:

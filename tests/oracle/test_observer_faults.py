@@ -296,7 +296,7 @@ def test_what_does_not_fit_is_named():
         run_observer(o, y[:0], u[:0])
     with pytest.raises(DimensionError, match="sizes seen in training"):
         replace(o, seen=Seen([1.0, 2.0], [1.0, 1.0]))
-    with pytest.raises(DataError, match="finite size"):
+    with pytest.raises(DataError, match="finite and not negative"):
         Seen([np.nan], [1.0])
 
 

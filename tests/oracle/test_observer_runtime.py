@@ -118,7 +118,7 @@ def test_a_runtime_that_makes_no_sense_is_refused():
         Runtime(delay=-1)
     with pytest.raises(DataError, match="should not exceed"):
         Runtime(lower=[1.0], upper=[0.0])
-    with pytest.raises(DataError, match="not a number"):
+    with pytest.raises(DataError, match="lower should be numbers"):
         Runtime(lower=[np.nan])
     with pytest.raises(DimensionError, match=r"runtime.lower should have shape \(3,\)"):
         observer(runtime=Runtime(lower=[1.0]))

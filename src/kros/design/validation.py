@@ -73,7 +73,7 @@ class TrainingSet:
     def normalised(self, models: ModelSet) -> TrainingSet:
         """Return the same in channels divided by the ranges of models."""
         outputs, inputs = models.output_scale[list(models.measured)], models.input_scale[: len(models.recorded_inputs)]
-        seen = None if self.seen is None else self.seen.times(1 / outputs, 1 / inputs)
+        seen = None if self.seen is None else Seen(self.seen.measured / outputs, self.seen.inputs / inputs)
         population, sensor = scale_population(self.population, models.sizes), in_units(self.sensor, models.sizes)
         return replace(self, population=population, seen=seen, sensor=sensor)
 

@@ -115,7 +115,7 @@ class ObserverData:
         for key, limit in self.runtime.limits().items():
             self._require(f"runtime.{key}", limit.shape, (n,))
         if self.seen is not None:
-            self._require("sizes seen in training", (len(self.seen.measured), len(self.seen.inputs)), (q, m))
+            self._require("sizes seen in training", (self.seen.measured.shape, self.seen.inputs.shape), ((q,), (m,)))
         if self.monitor is not None:
             self._require("the monitor", self.monitor.size.shape, (q,))
         require_measured(self.sensor, self.outputs)
@@ -133,8 +133,8 @@ class ObserverData:
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
                 )
         if self.guard is not None:
-            sizes = [len(bound) for bound in (self.guard.lower, self.guard.upper, self.guard.correction)]
-            self._require("the guard of states and correction", tuple(sizes), (n, n, K.n_states))
+            sizes = self.guard.lower.shape, self.guard.upper.shape, self.guard.correction.shape
+            self._require("the guard of states and correction", sizes, ((n,), (n,), (K.n_states,)))
 
     def _require(self, what: str, shape: tuple[Any, ...], wanted: tuple[Any, ...]) -> None:
         if shape != wanted:

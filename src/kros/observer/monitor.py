@@ -19,8 +19,8 @@ its start: while they go by, all that the monitor remembers is held.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -49,26 +49,21 @@ class Monitor:
     first: float = 0.0  # share that the first sample replaces, later ones less, down to `forget`
 
     def __post_init__(self) -> None:
-        arrays = ("filters", "size", "limits", "weights")
-        floats(self, *arrays)
+        arrays = {"filters": "finite numbers", "size": "positive and finite", "limits": "positive and finite"}
+        arrays |= {"weights": "finite and not negative"}
+        floats(self, "Monitor of an observer", **arrays)
         shapes, (bands, q) = [getattr(self, name).shape for name in arrays], (len(self.filters), self.size.size)
         if not bands or shapes != [(bands, 3), (q,), (q, bands), (q, bands)]:
             raise DataError(
                 f"Monitor of an observer: {', '.join(arrays)} should have shapes (bands, 3), (q), (q, bands) and "
                 f"(q, bands), found {shapes}."
             )
-        finite = all(np.isfinite(getattr(self, name)).all() for name in arrays)
-        sized = np.all(self.size > 0) and np.all(self.limits > 0) and np.all(self.weights >= 0)
         whole = np.all(self.weights == np.round(self.weights)) and self.weights.sum() == WEIGHT
-        if not (finite and sized and whole and 0 < self.forget <= 1 and 0 <= self.first <= 1 and self.settle >= 0):
+        if not (whole and 0 < self.forget <= 1 and 0 <= self.first <= 1 and self.settle >= 0):
             raise DataError(
-                "Monitor of an observer: numbers should be finite, size and limits positive, weights whole and of sum "
-                f"{WEIGHT}, forget and first within 0 and 1, settle at least 0; found {self}."
+                f"Monitor of an observer: weights should be whole and of sum {WEIGHT}, forget and first within 0 and 1, "
+                f"settle at least 0; found {self}."
             )
-
-    def times(self, y: Array) -> Self:
-        """Return the monitor for measurements in other units, multiplied by `y`, shape (q,)."""
-        return replace(self, size=self.size * y)
 
     def mean_squares(self, innovation: Array, judged: Flags) -> Array:
         """Return mean squares, (n_samples, batch, q, bands), after every sample; those not judged hold what was."""

@@ -41,16 +41,7 @@ class Seen:
     inputs: Array
 
     def __post_init__(self) -> None:
-        floats(self, "measured", "inputs")
-        for name, values in vars(self).items():
-            if values.ndim != 1 or not np.isfinite(values).all() or np.any(values < 0):
-                raise DataError(
-                    f"Sizes seen in training: {name} should be one finite size of at least 0 a channel, found {values}."
-                )
-
-    def times(self, measured: Array, inputs: Array) -> Seen:
-        """Return the sizes in other units of measure, by the factors of measurements, (q,), and inputs, (m,)."""
-        return Seen(self.measured * measured, self.inputs * inputs)
+        floats(self, "Sizes seen in training", **dict.fromkeys(vars(self), "finite and not negative"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +79,7 @@ class Runtime:
         what = "Runtime of an observer"
         if int(self.delay) != self.delay or self.delay < 0:
             raise DataError(f"{what}: the delay of {self.delay} should be a whole number of samples, at least 0.")
-        floats(self, *self.limits())
-        for name in self.limits():
-            if np.isnan(getattr(self, name)).any():
-                raise DataError(f"{what}: {name} is not a number; leave limits out, or make them infinite.")
+        floats(self, what, **dict.fromkeys(self.limits(), "numbers"))
         if len(self.limits()) > 1 and np.any(np.greater(*self.limits().values())):
             raise DataError(f"{what}: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
 
@@ -117,11 +105,6 @@ class Runtime:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
         return np.clip(x, *self.sides(x.shape[-1]), out=out) if self.limits() else x
 
-    def times(self, x: Array) -> Runtime:
-        """Return the same in other units of measure, by the factors of the states."""
-        changes: dict[str, Any] = {name: limit * x for name, limit in self.limits().items()}
-        return replace(self, **changes)
-
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Runtime:
         """Read the fields that a file holds; null stands for what is infinite."""
@@ -140,11 +123,12 @@ class Guard:
     settle: int  # samples after a start until the estimate is as good as before
 
     def __post_init__(self) -> None:
-        floats(self, "lower", "upper", "correction")
-        if not (np.all(self.lower < self.upper) and np.all(self.correction > 0) and self.settle >= 0):
+        what = "Guard of an observer"
+        floats(self, what, lower="numbers", upper="numbers", correction="positive")
+        if not (np.all(self.lower < self.upper) and self.settle >= 0):
             raise DataError(
-                f"Guard of an observer: lower bounds {self.lower} should be below the upper ones {self.upper}, sizes "
-                f"{self.correction} of the correction above zero, and {self.settle} samples to settle at least 0."
+                f"{what}: lower bounds {self.lower} should be below the upper ones {self.upper}, and {self.settle} "
+                "samples to settle at least 0."
             )
 
     def turned(self, turn: Array) -> Guard:

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ...core.arrays import Array, ArrayLike
-from ...core.errors import DimensionError, KrosError
+from ...core.errors import DataError, DimensionError, KrosError
 from ...core.linalg import floats
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ROUNDING
@@ -74,13 +74,10 @@ class ReliftScales:
     noise: Array
 
     def __post_init__(self) -> None:
-        floats(self, "error", "residual", "noise")
-        counted, others = np.isfinite(self.error), np.append(self.residual, self.noise)
-        if not (np.all(self.error > 0) and counted.any() and np.isfinite(others).all() and np.all(others >= 0)):
-            raise DimensionError(
-                "Re-lift scales: errors should be finite sizes above zero, some of them infinite, residuals and noise "
-                f"finite and not negative, found {self}."
-            )
+        others = dict.fromkeys(("residual", "noise"), "finite and not negative")
+        floats(self, "Re-lift scales", error="positive", **others)
+        if not np.isfinite(self.error).any():
+            raise DataError(f"Re-lift scales: one of the errors at least should be finite, found {self.error}.")
 
     @classmethod
     def typical(cls, ranges: ArrayLike, residual: Array, noise: ArrayLike) -> ReliftScales:

@@ -153,7 +153,7 @@ def test_phase_locked_loop_finds_the_phase_in_both_directions():
 
 def test_phase_locked_loop_finds_the_phase_of_a_simulated_drive():
     from kros.core.artifacts import plain
-    from kros.observer.residual.models import one_step_rows
+    from kros.observer.residual import one_step_rows
     from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
     simulated = HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=8.0, conditions=("noload",), seed=3).simulate()

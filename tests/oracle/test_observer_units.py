@@ -11,7 +11,7 @@ from kros.core.lti import StateSpace
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, Runtime, relift_certificate, run_observer
 from kros.observer.baselines.difference import FilteredDifference, followed
-from kros.observer.residual.models import least_squares
+from kros.observer.residual import least_squares
 from kros.observer.units import in_sizes
 from kros.synthesis import Injection
 

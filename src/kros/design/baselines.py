@@ -16,9 +16,8 @@ from ..identify import ModelSet
 from ..observer import Seen
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
-from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Moments, Ridge
-from ..observer.residual.one_step import one_step_covariance, one_step_residual
+from ..observer.residual import like_measurement_noise, one_step_covariance, one_step_residual
 from ..observer.screen import Screen
 from ..observer.sensor import delay_of
 from .validation import TrainingSet, rank

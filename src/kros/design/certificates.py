@@ -22,7 +22,7 @@ from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, 
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound, linear_estimate
 from ..observer.estimator.gaps import losses
-from ..observer.residual.one_step import one_step_residual
+from ..observer.residual import one_step_residual
 from ..observer.runtime import Guard
 from ..observer.screen import Screen
 from ..observer.simulate import run_observers

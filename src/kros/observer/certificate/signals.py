@@ -25,7 +25,7 @@ from ...core.rounding import AGREED, TINY
 from ...data import EpisodeBatch
 from ...loops.filtering import recursion
 from ..data import ObserverData
-from ..residual.one_step import one_step_residual
+from ..residual import one_step_residual
 from ..screen import screened
 from ..simulate import run_observer
 from .certificate import ReliftCertificate

@@ -147,13 +147,13 @@ class MeanProfile:
 
 def held(signal: Array, n_samples: int) -> Array:
     """Return a signal, shape (n, ...), of `n_samples` samples: cut, or held at its last one."""
-    return np.asarray(signal[np.minimum(np.arange(n_samples), len(signal) - 1)])
+    return signal[np.minimum(np.arange(n_samples), len(signal) - 1)]
 
 
 def largest_of(inputs: Sequence[Array]) -> Array:
     """Return the largest absolute value of every input over motions, one where it is always zero."""
     largest = np.max([np.abs(motion).max(axis=0) for motion in inputs], axis=0)
-    return np.asarray(np.where(largest > 0, largest, 1.0))
+    return np.where(largest > 0, largest, 1.0)
 
 
 def difference(u: Array, motion: Array, sizes: Array) -> float:

@@ -128,7 +128,7 @@ def hidden_error_percent(observers: Sequence[Observer], batches: Sequence[Episod
     """Return the mean error of hidden states over conditions, (observer,), errors times factors, (observer, n)."""
     percents = [percent_of(observers, batch) * by for batch in batches]
     logs = [np.log(hidden_mean(percent, observers[0].measured)) for percent in percents]
-    return np.asarray(np.exp(np.mean(logs, axis=0)))
+    return np.exp(np.mean(logs, axis=0))
 
 
 def scales_of(observers: Sequence[Observer], batch: EpisodeBatch, task: DesignTask) -> list[ReliftScales]:

@@ -133,7 +133,7 @@ def steady(largest: Mapping[Group, Array], settings: MonitorSettings = DEFAULT) 
     covariance = (1 - settings.shrink) * covariance + np.diag(diagonal)
     root, large = np.linalg.cholesky(covariance).T, 1e3 * float(np.sqrt(np.trace(covariance)))
     shares, _ = nnls(np.vstack([root, np.full((1, len(root)), large)]), np.append(np.zeros(len(root)), large))
-    return np.asarray((shares / shares.sum()).reshape(next(iter(largest.values())).shape))
+    return (shares / shares.sum()).reshape(next(iter(largest.values())).shape)
 
 
 def weighted(shares: Array) -> Array:

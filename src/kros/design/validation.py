@@ -133,7 +133,7 @@ def spread(keys: Sequence[T], count: int) -> list[T]:
 def hidden_mean(values: Array, measured: Sequence[int]) -> Array:
     """Return the geometric mean of values (..., n) over the hidden states (all, where none is hidden)."""
     hidden = [i for i in range(values.shape[-1]) if i not in measured] or list(measured)
-    return np.asarray(np.exp(np.mean(np.log(np.maximum(values[..., hidden], TINY)), axis=-1)))
+    return np.exp(np.mean(np.log(np.maximum(values[..., hidden], TINY)), axis=-1))
 
 
 def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, float]:

@@ -142,7 +142,7 @@ def kmeans_centres(data: Any, n: Count, seed: int, starts: Count = 8) -> Array:
     means, _ = kmeans(data / spread, n, iter=starts, rng=np.random.default_rng(seed))
     if len(means) < n:
         raise ConfigError(f"kmeans_centres: the data have {len(means)} clusters, not {n}; ask for fewer.")
-    return np.asarray(means * spread)
+    return means * spread
 
 
 KINDS: dict[str, Callable[..., Any]] = {

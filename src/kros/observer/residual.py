@@ -66,7 +66,7 @@ def mean_slopes(
 ) -> Array:
     """Return the lifted functions' slopes by the states at their mean over recordings, shape (p, n)."""
     window, _, values = _windows(lifting, states, inputs, parameters)
-    return np.asarray(lifting.slopes(window, values)[..., : lifting.n_states].mean(axis=(0, 1)))
+    return lifting.slopes(window, values)[..., : lifting.n_states].mean(axis=(0, 1))
 
 
 def _windows(
@@ -81,13 +81,13 @@ def _windows(
 def mean_error_dynamics(A: Array, slopes: Array) -> Array:
     """Return the dynamics of the deployed error, (n, n), of a model with slopes of shape (p, n)."""
     n = slopes.shape[1]
-    return np.asarray(A[:n, :n] + A[:n, n:] @ slopes)
+    return A[:n, :n] + A[:n, n:] @ slopes
 
 
 def one_step_covariance(residual: Array, lengths: ArrayLike) -> Array:
     """Return the mean product of residuals (n_samples, batch, n) over all episodes, shape (n, n)."""
     counted = residual[np.arange(len(residual))[:, None] < np.asarray(lengths)]
-    return np.asarray(counted.T @ counted / len(counted))
+    return counted.T @ counted / len(counted)
 
 
 def like_measurement_noise(covariance: Array, R: Array) -> float:
@@ -121,7 +121,7 @@ def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], 
         )
     names = list(dict.fromkeys(units))
     member = np.array([[u == name for u in units] for name in names], dtype=float)
-    return np.asarray(np.einsum("ub,bfij->ufij", member / (member @ counts)[:, None], total))
+    return np.einsum("ub,bfij->ufij", member / (member @ counts)[:, None], total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,4 +200,4 @@ def least_squares(regressors: Array, values: Array, rcond: float | None = None) 
     largest[largest == 0] = 1.0
     size = largest * np.sqrt(np.mean((regressors / largest) ** 2, axis=0))
     size[size == 0] = 1.0
-    return np.asarray(np.linalg.lstsq(regressors / size, values, rcond=rcond)[0] / size[:, None])
+    return np.linalg.lstsq(regressors / size, values, rcond=rcond)[0] / size[:, None]

@@ -64,4 +64,4 @@ def _bounded(system: StateSpace) -> Array:
         added = np.abs(states @ system.C.T).sum(axis=0)
         total, x = total + added, states[-1] @ system.A.T
         if np.all(added <= AGREED * total):
-            return np.asarray(total.T)
+            return total.T

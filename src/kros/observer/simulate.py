@@ -63,7 +63,7 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return np.asarray(run_observers([observer], y, u, parameters)[0])
+    return run_observers([observer], y, u, parameters)[0]
 
 
 def run_observers(

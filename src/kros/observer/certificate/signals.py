@@ -124,7 +124,7 @@ def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array,
     """Return the scaled errors and what the slopes act on, (n_samples, batch, .), with slopes in the middle."""
     w = np.concatenate([w, np.zeros((1, *w.shape[1:]))])
     xi = recursion(system.A, w, first @ system.start.T, system.B)
-    return np.asarray(xi @ system.C.T), np.asarray(xi @ system.M.T + w @ system.D.T)
+    return xi @ system.C.T, xi @ system.M.T + w @ system.D.T
 
 
 def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:

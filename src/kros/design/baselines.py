@@ -211,4 +211,4 @@ def unit_means(
         if apart[at] <= same:
             states = held(part.states[:, 0, list(estimated)], len(motions[at]))
             profiles[at].setdefault(part.units[0], []).append(states)
-    return [{unit: np.asarray(np.mean(some, axis=0)) for unit, some in one.items()} for one in profiles]
+    return [{unit: np.mean(some, axis=0) for unit, some in one.items()} for one in profiles]

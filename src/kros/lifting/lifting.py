@@ -154,15 +154,8 @@ class Lifting:
         x = self._windows(x)
         lifted = np.empty((*x.shape[:-1], self.n_lifted))
         lifted[..., : self.n_states] = x[..., : self.n_states]
-        self.lift_into(lifted, parameters, x[..., self.n_states :])
+        self._fill(lifted[..., self.n_states :], self._programs[0], parameters, x)
         return lifted
-
-    def lift_into(self, lifted: Array, parameters: Parameters | None = None, earlier: Array | None = None) -> None:
-        """Fill the lifted functions behind states that are already in place, shape (..., n + p).
-
-        Earlier values, shape (..., n_earlier), are needed where the lifting has delays.
-        """
-        self._programs[0].fill(lifted, self._values(parameters, lifted, earlier), self.n_states)
 
     def lift_inputs(self, u: ArrayLike, window: ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the inputs (..., m) with the input functions behind them, (..., m + r), on windows (..., n_window)."""
@@ -172,7 +165,7 @@ class Lifting:
             return u
         window = self._windows(window)
         out = np.concatenate([u, np.empty((*u.shape[:-1], len(self.input_functions)))], axis=-1)
-        self._programs[1].fill(out, self._values(parameters, window, window[..., self.n_states :], u), u.shape[-1])
+        self._fill(out[..., u.shape[-1] :], self._programs[1], parameters, window, u)
         return out
 
     def windows(self, x: Array, u: Array) -> Array:
@@ -201,7 +194,7 @@ class Lifting:
         x, names, inputs = self._windows(x), names or self.window.names, None if u is None else np.asarray(u)
         formulas = self.formulas if inputs is None else self.input_formulas
         slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
-        _derivatives(formulas, names).fill(slopes, self._values(parameters, x, x[..., self.n_states :], inputs))
+        self._fill(slopes, _derivatives(formulas, names), parameters, x, inputs)
         return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
 
     def slope_bounds(self, box: Box | None = None) -> tuple[Array, Array]:
@@ -231,28 +224,17 @@ class Lifting:
         functions, gamma = ([formula.expression for formula in f] for f in (self.formulas, self.input_formulas))
         return Program.of(functions), Program.of(gamma)
 
-    @cached_property
-    def _read(self) -> frozenset[str]:
-        return frozenset(name for formula in self.formulas + self.input_formulas for name in formula.used)
-
     def _windows(self, x: ArrayLike) -> Array:
         x, names = np.asarray(x, dtype=float), self.window.names
         if x.shape[-1:] != (len(names),):
             raise DimensionError(f"Lifting: expected {len(names)} entries {names} last, found shape {x.shape}.")
         return x
 
-    def _values(
-        self, parameters: Parameters | None, x: Array, earlier: Array | None, u: Array | None = None
-    ) -> dict[str, Array]:
-        """Return arrays by name, of states those that functions read: an observer may have many more."""
-        values = self.parameter_values(parameters)
-        values |= {name: x[..., i] for i, name in enumerate(self.states) if name in self._read}
-        if earlier is None and self.window.depths:
-            raise DimensionError(f"Lifting: {self.window.earlier} are missing; pass earlier values, or lift windows.")
-        for names, columns in ((self.window.earlier, earlier), (self.inputs, u)):
-            if columns is not None:
-                values |= {name: columns[..., i] for i, name in enumerate(names)}
-        return values
+    def _fill(
+        self, out: Array, program: Program, parameters: Parameters | None, window: Array, u: Array | None = None
+    ) -> None:
+        """Write the values of a program along the last axis."""
+        program.fill(out, self.parameter_values(parameters) | self.window.columns(program.names, window, u))
 
 
 @lru_cache

@@ -49,9 +49,9 @@ class Program:
             registers[into] = function(*(registers[i] for i in operands))
         return [registers[i] for i in self.outputs]
 
-    def fill(self, out: Array, values: Mapping[str, Any], first: int = 0) -> None:
-        """Write the values of the expressions along the last axis, from one column on."""
-        for column, value in enumerate(self.run(values), first):
+    def fill(self, out: Array, values: Mapping[str, Any]) -> None:
+        """Write the values of the expressions along the last axis."""
+        for column, value in enumerate(self.run(values)):
             out[..., column] = value
 
     @cached_property

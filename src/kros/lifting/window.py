@@ -109,10 +109,15 @@ class Window:
         if self.inputs and u.shape[-1] != len(self.inputs):
             raise DimensionError(f"Lifting: expected {len(self.inputs)} inputs {self.inputs} last, found {u.shape}.")
 
-    def values(self, window: Array, u: Array | None = None) -> Mapping[str, Array]:
-        """Return the columns by name, the present inputs with them where they are given."""
-        named = {name: window[..., i] for i, name in enumerate(self.names)}
-        return named if u is None else named | {name: u[..., i] for i, name in enumerate(self.inputs)}
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
+    def columns(self, names: Iterable[str], window: Array, u: Array | None = None) -> dict[str, Array]:
+        """Return some columns by name, present inputs among them where they are given."""
+        columns = {name: window[..., self._places[name]] for name in names if name in self._places}
+        given = {} if u is None else {name: u[..., i] for i, name in enumerate(self.inputs)}
+        return columns | given
 
 
 @dataclass(frozen=True)
@@ -142,7 +147,7 @@ class FormulaSeparation:
     def evaluate(self, window: Array, u: Array | None = None) -> Array:
         """Return the parameter-free functions at windows (..., n_window), and inputs if given; (..., n_basis)."""
         out = np.moveaxis(np.empty((len(self.basis), *window.shape[:-1])), 0, -1)  # a function's values side by side
-        self._program.fill(out, self.window.values(window, u))
+        self._program.fill(out, self.window.columns(self._program.names, window, u))
         return out
 
     def matrix(self, parameters: Mapping[str, ArrayLike]) -> Array:

@@ -199,7 +199,7 @@ class ObserverData:
             inputs = np.broadcast_to(0.0 if u is None else u, (*y.shape[:-1], len(self.inputs)))
             values = self.values(parameters)
             lifted = [self.lifting.lift(x, values), self.lifting.lift_inputs(inputs, x, values)]
-            x = np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
+            x = np.concatenate(lifted, axis=-1) @ self.bank.start.T
         return x
 
     def own(self, parameters: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:

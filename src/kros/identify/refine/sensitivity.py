@@ -132,7 +132,7 @@ class _Run:
         psi[:n] = window[:n]
         for k in range(h, len(self.x) - 1):
             u = self.u[k]
-            lifting.lift_into(psi[:nl].T, self.parameters, window[n:].T)
+            psi[:nl] = lifting.lift(window.T, self.parameters).T
             psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
             terms = np.stack([*recent[0], *(recent[delay][state] for _, state, delay in past)])
             following = np.einsum("abj,bqj->aqj", self._state_matrix(window, u, past), terms)

@@ -71,9 +71,7 @@ class ExtendedKalman:
     def _ahead(self, window: Array, u: Array, values: Mapping[str, ArrayLike]) -> Array:
         """Return the next states by the model."""
         n, lifting = self.lifting.n_states, self.lifting
-        return np.asarray(
-            lifting.lift(window, values) @ self.A[:n].T + lifting.lift_inputs(u, window, values) @ self.B[:n].T
-        )
+        return lifting.lift(window, values) @ self.A[:n].T + lifting.lift_inputs(u, window, values) @ self.B[:n].T
 
     def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
         """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""

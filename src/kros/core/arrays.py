@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,4 +13,5 @@ AnyArray = NDArray[Any]
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
+Parameters = Mapping[str, ArrayLike]  # of a lifting, by name
 Whole = NDArray[np.int64]

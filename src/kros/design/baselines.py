@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
+from ..core.arrays import Array, Parameters
 from ..core.errors import ConfigError, DataError, SynthesisError
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
@@ -21,8 +21,6 @@ from ..observer.residual import like_measurement_noise, one_step_covariance, one
 from ..observer.screen import Screen
 from ..observer.sensor import delay_of
 from .validation import TrainingSet, rank
-
-Parameters = Mapping[str, Array]
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ DEFAULT = BaselineSettings()
 class Estimator(Protocol):
     """What can be run over a batch of episodes."""
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Return estimates, shape (n_samples, batch, n)."""
 
 
@@ -55,7 +53,7 @@ class Baseline:
     limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
 
-    def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
+    def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Mapping[str, Array]) -> Array:
         """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
         units: dict[str, list[int]] = {}
         for i, key in enumerate(keys):
@@ -135,7 +133,7 @@ class MeanProfile:
     inputs: Sequence[Array]  # (n_samples, m)
     states: Sequence[Array]  # (n_samples, h)
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest."""
         del parameters
         estimate, sizes = np.full((*y.shape[:2], self.n_states), np.nan), largest_of(self.inputs)

@@ -89,9 +89,11 @@ def certified_on(task: DesignTask) -> list[EpisodeBatch]:
 
 def _model_parts(observers: Sequence[Observer], batches: Sequence[EpisodeBatch], task: DesignTask) -> Iterator[Parts]:
     """Yield guards, certificates and bounds of corrected models, which run side by side."""
-    guards, scales = guards_of(observers, batches), scales_of(observers, batches[0], task)
-    for observer, guard, scale in zip(observers, guards, scales, strict=True):
-        certificate = certify_model(observer, scale, task)
+    first, sizes = observers[0], task.models.output_scale[: len(observers[0].recorded)]
+    recorded = batches[0].states, batches[0].inputs, first.own(batches[0].parameters)
+    for observer, guard in zip(observers, guards_of(observers, batches), strict=True):
+        residual = one_step_residual(first.lifting, observer.A, observer.B, *recorded)
+        certificate = certify_model(observer, ReliftScales.typical(sizes, residual, task.noise), task)
         bound = signal_bound(certificate, observer, batches[0])
         by = factors(observer, {})[0][: len(observer.recorded)]
         yield guard, certificate.in_sizes(observer, {}), bound.in_sizes(by)
@@ -129,14 +131,6 @@ def hidden_error_percent(observers: Sequence[Observer], batches: Sequence[Episod
     percents = [percent_of(observers, batch) * by for batch in batches]
     logs = [np.log(hidden_mean(percent, observers[0].measured)) for percent in percents]
     return np.exp(np.mean(logs, axis=0))
-
-
-def scales_of(observers: Sequence[Observer], batch: EpisodeBatch, task: DesignTask) -> list[ReliftScales]:
-    """Return the sizes that every gain refers to: ranges, one-step residuals of the observer's model, quantisation."""
-    first, sizes = observers[0], task.models.output_scale[: len(observers[0].recorded)]
-    recorded = batch.states, batch.inputs, first.own(batch.parameters)
-    residuals = (one_step_residual(first.lifting, o.A, o.B, *recorded) for o in observers)
-    return [ReliftScales.typical(sizes, residual, task.noise) for residual in residuals]
 
 
 def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:

@@ -19,14 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
+from ..core.arrays import Array, ArrayLike, Parameters
 from ..core.errors import ConfigError, DimensionError
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
 from .program import Program
 from .window import FormulaSeparation, Window
-
-Parameters = Mapping[str, ArrayLike]
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ combinations of parameter-free ones, ``sigma(w; q) = M(q) g(w)``, so that data a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Index
+from ..core.arrays import Array, Index, Parameters
 from ..core.errors import ConfigError, DataError, DimensionError
 from .formula import MAX_TERMS, Formula, base_and_delay, count_terms, delayed_name
 from .program import Program
@@ -150,7 +150,7 @@ class FormulaSeparation:
         self._program.fill(out, self.window.columns(self._program.names, window, u))
         return out
 
-    def matrix(self, parameters: Mapping[str, ArrayLike]) -> Array:
+    def matrix(self, parameters: Parameters) -> Array:
         """Return M(q) for parameter values of any common shape, shape (..., p, n_basis)."""
         values = {name: np.asarray(parameters[name], dtype=float) for name in self.parameters}
         shape = np.broadcast_shapes(*(v.shape for v in values.values()))

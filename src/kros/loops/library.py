@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import ArrayLike
+from ..core.arrays import Parameters
 from ..core.errors import ConfigError
 from ..lifting import Lifting
 from ..lifting.program import Program
@@ -84,7 +84,7 @@ def library() -> Library | None:
 
 
 def formulas(
-    lifting: Lifting, values: Mapping[str, ArrayLike] | None, m: int, batch: int, entries: tuple[int, ...] = ()
+    lifting: Lifting, values: Parameters | None, m: int, batch: int, entries: tuple[int, ...] = ()
 ) -> tuple[str, dict[str, Any]]:
     """Return what the loops need to know of a lifting with m recorded inputs and parameters of shape (batch,)."""
     given = lifting.parameter_values(values)

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
+from ..core.arrays import Array, ArrayLike, Parameters
 from ..core.errors import ConfigError, DimensionError
 from ..core.linalg import balanced_size
 from ..core.lti import StateSpace
@@ -187,9 +187,7 @@ class ObserverData:
         """States that recordings hold: all but the internal ones."""
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
-    def initial(
-        self, y: ArrayLike, parameters: Mapping[str, ArrayLike] | None = None, u: ArrayLike | None = None
-    ) -> Array:
+    def initial(self, y: ArrayLike, parameters: Parameters | None = None, u: ArrayLike | None = None) -> Array:
         """Return the first estimate, (..., n): measurements, and others zero or as a bank starts."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
@@ -202,13 +200,11 @@ class ObserverData:
             x = np.concatenate(lifted, axis=-1) @ self.bank.start.T
         return x
 
-    def own(self, parameters: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
+    def own(self, parameters: Parameters) -> dict[str, ArrayLike]:
         """Return those parameters of many that the lifting has."""
         return {name: parameters[name] for name in self.lifting.parameters if name in parameters}
 
-    def values(
-        self, parameters: Mapping[str, ArrayLike] | None = None, shape: tuple[int, ...] | None = None
-    ) -> dict[str, Any]:
+    def values(self, parameters: Parameters | None = None, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
         """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`."""
         known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
         given = {name: np.asarray(values[name], dtype=float) for name in known if values.get(name) is not None}

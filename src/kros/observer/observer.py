@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
+from ..core.arrays import Array, ArrayLike, Parameters
 from ..core.lti import gain
 from ..lifting import Lifting
 from ..synthesis.result import Injection
@@ -49,7 +49,7 @@ class Observer(ObserverData):
         controller = gain(np.zeros((len(A), len(measured))), sample_period_s)
         return cls(name, lifting, A, B, measured, inputs, controller, Injection.STATE, sample_period_s)
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch of episodes; see `run_observer`."""
         return run_observer(self, y, u, parameters)
 

@@ -26,13 +26,13 @@ the correction makes the observer stable.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike
+from ..core.arrays import AnyArray, Array, ArrayLike, Parameters
 from ..core.errors import DataError
 from ..core.rounding import TINY
 from ..data import EpisodeBatch
@@ -51,7 +51,7 @@ def one_step_residual(
     B: Array,
     states: Array,
     inputs: Array,
-    parameters: Mapping[str, ArrayLike] | None = None,
+    parameters: Parameters | None = None,
 ) -> Array:
     """Run the one-step model along recordings and return what it misses; A (n_lifted, n_lifted), B (n_lifted, m)."""
     n, h = lifting.n_states, lifting.history
@@ -61,16 +61,14 @@ def one_step_residual(
     return states[h + 1 :] - np.swapaxes(lifted @ A[:n].T + widened @ B[:n].T, 0, 1)
 
 
-def mean_slopes(
-    lifting: Lifting, states: Array, inputs: Array, parameters: Mapping[str, ArrayLike] | None = None
-) -> Array:
+def mean_slopes(lifting: Lifting, states: Array, inputs: Array, parameters: Parameters | None = None) -> Array:
     """Return the lifted functions' slopes by the states at their mean over recordings, shape (p, n)."""
     window, _, values = _windows(lifting, states, inputs, parameters)
     return lifting.slopes(window, values)[..., : lifting.n_states].mean(axis=(0, 1))
 
 
 def _windows(
-    lifting: Lifting, states: Array, inputs: Array, parameters: Mapping[str, ArrayLike] | None
+    lifting: Lifting, states: Array, inputs: Array, parameters: Parameters | None
 ) -> tuple[Array, Array, dict[str, Array]]:
     """Return windows, inputs and parameters of recordings, the batch first and time second."""
     x, u = np.swapaxes(states, 0, 1), np.swapaxes(inputs, 0, 1)

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Flags, Index
+from ..core.arrays import Array, Flags, Index, Parameters
 from ..loops import Library, formulas, library
 from .data import ObserverData
 from .monitor import judged_samples
 from .runtime import bounds
 from .screen import Bits, Held, SampleStatus, Screened, screened
-from .step import Parameters, Steps, forward
+from .step import Steps, forward
 
 _ROWS = 1000  # samples predicted forward at a time
 
@@ -23,7 +23,7 @@ def run_observer(
     observer: ObserverData,
     y: Array,
     u: Array,
-    parameters: Mapping[str, ArrayLike] | None = None,
+    parameters: Parameters | None = None,
 ) -> Array:
     """Run an observer over a batch of episodes.
 
@@ -66,9 +66,7 @@ def run_observer(
     return run_observers([observer], y, u, parameters)[0]
 
 
-def run_observers(
-    observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None
-) -> Array:
+def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Parameters | None = None) -> Array:
     """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
     samples = screened(observers[0], y, u)
     courses = [Course(observer, samples.starts.shape[1], parameters) for observer in observers]
@@ -76,7 +74,7 @@ def run_observers(
 
 
 def run_innovations(
-    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None, settle: int = 0
+    observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, settle: int = 0
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
     run = Course(observer, y.shape[1], parameters).take(y, u)

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Flags, Index
+from ..core.arrays import Array, Flags, Index, Parameters
 from .data import ObserverData
 from .filter_bank import Gaps
 from .runtime import bounds
-
-Parameters = Mapping[str, ArrayLike]
 
 
 class Steps:

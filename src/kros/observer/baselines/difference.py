@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike
+from ...core.arrays import Array, Parameters
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 
@@ -23,7 +23,7 @@ class FilteredDifference:
     sample_period_s: float
     scales: tuple[float, ...] = ()  # of every pair: the state over the rate, which units of measure decide; one
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate the rates from y (n_samples, batch, q), from rest; (n_samples, batch, n), NaN for other states."""
         del u, parameters
         estimate, found = np.full((*y.shape[:2], self.n_states), np.nan), rates(y, self.cutoff_hz, self.sample_period_s)

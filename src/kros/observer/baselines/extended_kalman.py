@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike
+from ...core.arrays import Array, Parameters
 from ...core.errors import DimensionError
 from ...lifting import Lifting
 
@@ -40,12 +40,12 @@ class ExtendedKalman:
     parameters: Mapping[str, float] = field(default_factory=dict)
     delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Predict a batch from y (n_samples, batch, q), NaN where missing, and u, shape (n_samples, batch, n)."""
         return self.run_all(y, u, parameters)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def run_all(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
+    def run_all(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
         lifting, n, C, (n_samples, batch) = self.lifting, self.lifting.n_states, list(self.measured), y.shape[:2]
         values = {**self.parameters, **(parameters or {})}
@@ -68,7 +68,7 @@ class ExtendedKalman:
             earlier = lifting.window.advance(window, u[sample])
         return np.moveaxis(estimates, 0, 1)
 
-    def _ahead(self, window: Array, u: Array, values: Mapping[str, ArrayLike]) -> Array:
+    def _ahead(self, window: Array, u: Array, values: Parameters) -> Array:
         """Return the next states by the model."""
         n, lifting = self.lifting.n_states, self.lifting
         return lifting.lift(window, values) @ self.A[:n].T + lifting.lift_inputs(u, window, values) @ self.B[:n].T
@@ -81,7 +81,7 @@ class ExtendedKalman:
         L, nu = np.where(lost[..., None], 0.0, PC @ np.linalg.inv(S)), np.where(lost, 0.0, nu)
         return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
-    def _late(self, y: Array, u: Array, values: Mapping[str, ArrayLike]) -> Array:
+    def _late(self, y: Array, u: Array, values: Parameters) -> Array:
         """Run on what was measured, and predict each estimate to the row in which it is there."""
         d = min(self.delay, len(y) - 1)
         if self.lifting.history:

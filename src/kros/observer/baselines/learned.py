@@ -11,12 +11,12 @@ equal.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike, Whole
+from ...core.arrays import Array, Parameters, Whole
 from ...core.errors import DataError
 from ...core.rounding import TINY
 from ...data import EpisodeBatch
@@ -41,7 +41,7 @@ class Learned:
     constant: Array  # (h,)
     weights: Array  # (delays, q + m, h): the latest sample first
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n)."""
         from scipy.signal import oaconvolve
 

@@ -66,19 +66,13 @@ class Monitor:
             )
 
     def mean_squares(self, innovation: Array, judged: Flags) -> Array:
-        """Return mean squares, (n_samples, batch, q, bands), after every sample; those not judged hold what was."""
+        """Return mean squares of a machine, (n_samples, q, bands), after every sample; those not judged change none."""
         from scipy.signal import lfilter
 
-        scaled = self.scaled(innovation)
-        squares = np.zeros((*innovation.shape, len(self.filters)))
-        for machine in range(innovation.shape[1]):
-            rows = np.flatnonzero(judged[:, machine])
-            if len(rows):
-                bands = [lfilter([b, 0, -b], [1, a1, a2], scaled[rows, machine], axis=0) for b, a1, a2 in self.filters]
-                means = self._remembered(np.stack(bands, axis=-1) ** 2)
-                latest = np.searchsorted(rows, np.arange(len(judged)), side="right")
-                squares[:, machine] = np.concatenate([np.zeros((1, *means.shape[1:])), means])[latest]
-        return squares
+        scaled = self.scaled(innovation[judged])
+        bands = [lfilter([b, 0, -b], [1, a1, a2], scaled, axis=0) for b, a1, a2 in self.filters]
+        means = self._remembered(np.stack(bands, axis=-1) ** 2)
+        return np.concatenate([np.zeros((1, *self.limits.shape)), means])[np.cumsum(judged)]
 
     def scaled(self, innovation: Array) -> Array:
         """Return innovations (..., q) over their sizes, within what counts at most."""
@@ -87,8 +81,8 @@ class Monitor:
 
     def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
         """Return the mean squares of episodes, (n_samples, q, bands), that a machine has one after the other."""
-        innovation, judged = (np.concatenate(parts)[:, None] for parts in zip(*episodes, strict=True))
-        return np.split(self.mean_squares(innovation, judged)[:, 0], np.cumsum([len(own) for _, own in episodes])[:-1])
+        innovation, judged = (np.concatenate(parts) for parts in zip(*episodes, strict=True))
+        return np.split(self.mean_squares(innovation, judged), np.cumsum([len(own) for _, own in episodes])[:-1])
 
     def _remembered(self, squares: Array) -> Array:
         """Return the means of squares, shape (n_samples, q, bands), after every sample."""

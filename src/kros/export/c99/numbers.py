@@ -249,7 +249,7 @@ class Source:
             **{name: self.row(getattr(own, name)) for name in ("forget", "reach", "half", "recovery")},
             "longest": self.row(longest_age(own.half)),
             "ramp": self.sums(o.A[z, z]),
-            "into": self.matrix(o.A[z][:, list(o.measured)]),
+            "into": self.row(o.A[z][:, list(o.measured)]),
             "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
         }
 
@@ -261,9 +261,9 @@ class Source:
         numbers = {"quiet": QUIET, "forget": own.forget, "first": max(own.first, own.forget), "largest": LARGEST}
         return {
             "bands": len(own.filters),
-            "filters": self.matrix(own.filters),
+            "filters": self.row(own.filters),
             "inverse_size": self.row(1 / own.size),
-            "inverse_limit": self.matrix(1 / own.limits),
+            "inverse_limit": self.row(1 / own.limits),
             "weights": own.weights.astype(int).tolist(),
             **{name: self.precision.literal(value) for name, value in numbers.items()},
             "settle": own.settle,
@@ -289,12 +289,8 @@ class Source:
         """Return what is multiplied by which entry of a column, row by row; zeros are left out."""
         return [[(int(j), self.precision.literal(float(row[j]))) for j in np.flatnonzero(row)] for row in values]
 
-    def matrix(self, values: Array) -> list[list[str]]:
-        """Return the literals of a matrix, row by row."""
-        return [self.row(numbers) for numbers in values]
-
-    def row(self, values: Array) -> list[str]:
-        """Return the literals of a row."""
+    def row(self, values: Array) -> list[Any]:
+        """Return the literals of numbers, row by row."""
         return row(values, self.precision)
 
     def code(self, expression: Any) -> str:
@@ -311,8 +307,10 @@ class Source:
         return [dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True)]
 
 
-def row(values: Array, precision: Precision = DOUBLE) -> list[str]:
-    """Return the literals of a row; infinity as the largest number."""
+def row(values: Array, precision: Precision = DOUBLE) -> list[Any]:
+    """Return the literals of numbers, row by row; infinity as the largest number."""
+    if values.ndim > 1:
+        return [row(one, precision) for one in values]
     return [precision.literal(v) for v in np.clip(values, -precision.largest, precision.largest).tolist()]
 
 

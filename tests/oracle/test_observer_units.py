@@ -70,7 +70,7 @@ def test_the_certificate_says_the_same_in_other_sizes():
         ReliftScales(np.ones(2), np.array([0.05, 0.2 / 3]), np.array([0.005])),
     )
     direct = relift_certificate(one, box, scales)
-    told = found.in_sizes(in_sizes(one, {"x": 2.0, "v": 3.0}), {})
+    told = found.in_units(in_sizes(one, {"x": 2.0, "v": 3.0}))
     assert all(found.certified for found in (direct, told))
     assert told.gain == pytest.approx(direct.gain, rel=0.02)  # a proof stops within two percent of the least gain
     assert told.assumptions == direct.assumptions

@@ -68,7 +68,7 @@ def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
     for design, (guard, certificate, bound), *percents in zip(
         designs, parts, *map(np.ndarray.tolist, errors), strict=True
     ):
-        facts = {**design.facts, **_facts(certificate, bound, design.observer.measured, percents)}
+        facts = {**design.facts, **_facts(certificate, bound, design.observer, percents)}
         observer = replace(design.observer, guard=guard)
         certified.append(replace(design, observer=observer, certificate=certificate, facts=facts))
     return certified
@@ -82,7 +82,9 @@ def certified_on(task: DesignTask) -> list[EpisodeBatch]:
         others.setdefault(key.condition, []).append(key)
     batches = []
     for training in (task.training, *(replace(task.recordings, keys=tuple(keys)) for keys in others.values())):
-        first = training.first_of_units().read().head(DEFAULT.samples)
+        firsts = {key.unit: key for key in reversed(training.keys)}
+        keys = tuple(key for key in training.keys if firsts[key.unit] == key)
+        first = replace(training, keys=keys).read().head(DEFAULT.samples)
         batches.append(first if len(first.states) > TRAINING.short else training.read())
     return batches
 
@@ -95,8 +97,7 @@ def _model_parts(observers: Sequence[Observer], batches: Sequence[EpisodeBatch],
         residual = one_step_residual(first.lifting, observer.A, observer.B, *recorded)
         certificate = certify_model(observer, ReliftScales.typical(sizes, residual, task.noise), task)
         bound = signal_bound(certificate, observer, batches[0])
-        by = factors(observer, {})[0][: len(observer.recorded)]
-        yield guard, certificate.in_sizes(observer, {}), bound.in_sizes(by)
+        yield guard, certificate.in_units(observer), bound
 
 
 def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Parts:
@@ -111,17 +112,18 @@ def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Part
     scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(at)))
     recorded = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[at])
     bound = left_out_bound(observer, sizes, units, errors, design.facts["left_out_worst_percent"])
-    return observer.guard, replace(filter_certificate(observer, scales), scales=recorded), bound.in_sizes(by[:n])
+    return observer.guard, replace(filter_certificate(observer, scales), scales=recorded), bound
 
 
 def _facts(
-    certificate: ReliftCertificate, bound: SignalBound, measured: Sequence[int], errors: Sequence[float]
+    certificate: ReliftCertificate, bound: SignalBound, observer: Observer, errors: Sequence[float]
 ) -> dict[str, Any]:
     """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
     facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
     facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
-    facts |= bound.facts(measured) | {"assumptions": certificate.assumptions}
-    cover = zip(bound.states, bound.cover.tolist(), strict=True)
+    facts |= bound.facts(observer.measured) | {"assumptions": certificate.assumptions}
+    recorded = bound.cover * factors(observer, {})[0][: len(bound.states)]
+    cover = zip(bound.states, recorded.tolist(), strict=True)
     facts["set_bound"] = {state: value if np.isfinite(value) else None for state, value in cover}
     return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 

@@ -77,11 +77,6 @@ class TrainingSet:
         population, sensor = scale_population(self.population, models.sizes), in_units(self.sensor, models.sizes)
         return replace(self, population=population, seen=seen, sensor=sensor)
 
-    def first_of_units(self) -> TrainingSet:
-        """Return the first episode of every unit."""
-        firsts = {key.unit: key for key in reversed(self.keys)}
-        return replace(self, keys=tuple(key for key in self.keys if firsts[key.unit] == key))
-
     def read(self, most: int | None = TRAINING.samples) -> EpisodeBatch:
         """Read the episodes, cut short, or whole with None."""
         return self._shown(self.keys, most)

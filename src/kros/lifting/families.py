@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import signature
 from itertools import combinations_with_replacement
@@ -122,7 +122,12 @@ def radial(names: Names, centres: Any, length: Lengths) -> Formulas:
     if centres.shape[1] != len(names) or not len(centres):
         raise ConfigError(f"radial: centres should have the shape (n, {len(names)}), found shape {centres.shape}.")
     lengths = np.broadcast_to(lengths, (len(names),))
-    return tuple(f"exp(-({_squared_distance(names, centre, lengths)})/2)" for centre in centres)
+    texts = []
+    for centre in centres:
+        columns = zip(names, centre, lengths, strict=True)
+        parts = (f"(({wrapped(name)} - {number(c)})/{number(scale)})**2" for name, c, scale in columns)
+        texts.append(f"exp(-({' + '.join(parts)})/2)")
+    return tuple(texts)
 
 
 @checked
@@ -191,11 +196,6 @@ def number(value: float) -> str:
 def wrapped(formula: str) -> str:
     """Put a formula into parentheses where it is more than a name."""
     return formula if formula.isidentifier() else f"({formula})"
-
-
-def _squared_distance(names: Sequence[str], centre: Array, lengths: Array) -> str:
-    columns = zip(names, centre, lengths, strict=True)
-    return " + ".join(f"(({wrapped(name)} - {number(c)})/{number(scale)})**2" for name, c, scale in columns)
 
 
 def _finite(what: str, values: Any) -> Array:

@@ -189,37 +189,19 @@ class Precision:
 
 def c_code(expression: Any, name: Callable[[str], str], precision: Precision | None = None) -> str:
     """Return a SymPy tree as a C expression."""
-    writer = Writer(sorted(symbol.name for symbol in expression.free_symbols))
-    return _CText(writer, name, precision or Precision()).of(writer.write(tree_of(expression)))
-
-
-@dataclass(frozen=True)
-class _CText:
-    writer: Writer
-    name: Callable[[str], str]
-    precision: Precision
-
-    def of(self, value: int) -> str:
-        """Return the text of a value."""
-        kind, literal = self._kind(value), self.precision.literal
-        if kind == "symbol":
-            return self.name(self.writer.names[value])
-        if kind == "number":
-            text = literal(self.writer.constants[-1 - value])
-            return f"({text})" if text.startswith("-") else text
-        _, first, second = self.writer.operations[value - len(self.writer.names)]
+    precision = precision or Precision()
+    program, literal = Program.of([expression]), precision.literal
+    numbers = map(literal, program.constants.tolist())
+    texts = [*map(name, program.names), *(f"({text})" if text.startswith("-") else text for text in numbers)]
+    for number, _, first, second in program.code.tolist():
+        kind, x, other = _KINDS[number], texts[first], texts[second]
         if kind in _SIGNS:
-            return f"({self.of(first)} {_SIGNS[kind]} {self.of(second)})"
-        inner = self.of(first)
-        if kind == "power":
-            return f"pow{self.precision.suffix}({inner}, {literal(self.writer.constants[-1 - second])})"
-        if kind == "sign":
+            texts.append(f"({x} {_SIGNS[kind]} {other})")
+        elif kind == "power":
+            texts.append(f"pow{precision.suffix}({x}, {other})")
+        elif kind == "sign":
             zero, one = literal(0.0), literal(1.0)
-            return f"((({inner}) > {zero}) ? {one} : ((({inner}) < {zero}) ? -{one} : {zero}))"
-        return f"{_NAMES.get(kind, kind)}{self.precision.suffix}({inner})"
-
-    def _kind(self, value: int) -> str:
-        if value < 0:
-            return "number"
-        given = len(self.writer.names)
-        return "symbol" if value < given else self.writer.operations[value - given][0]
+            texts.append(f"((({x}) > {zero}) ? {one} : ((({x}) < {zero}) ? -{one} : {zero}))")
+        else:
+            texts.append(f"{_NAMES.get(kind, kind)}{precision.suffix}({x})")
+    return texts[program.outputs[0]]

@@ -127,8 +127,3 @@ def _tape(lifting: Lifting, m: int, entries: tuple[int, ...]) -> dict[str, Any]:
         "present": window.present,
         "slope": np.column_stack([places, moved]),
     }
-
-
-def linear_formulas(n: int, m: int) -> tuple[str, dict[str, Any]]:
-    """Return what the loops need to know of a model of n states and m inputs without lifted functions."""
-    return "formulas", {"n": n, "m": m, "registers": n + m, "lifted": np.arange(n + m), "n_lifted": n, "n_inputs": m}

@@ -94,7 +94,7 @@ class RunningAngleLoad:
         phi = np.where(np.isnan(phi), self._phi, phi)
         self._psi = psi = pole * self._psi + np.nan_to_num(phi - self._phi)
         self._phi, self._excess, self._need = phi, pole * self._excess, pole * self._need
-        coefficients = self._coefficients()
+        coefficients = np.linalg.solve(self._gram.transpose(2, 0, 1), self._right.T[..., None])[..., 0].T
         of_angle = np.sum(np.nan_to_num(phi) * coefficients, axis=0)  # zero where no angle has arrived yet
         load = seen - self._excess + of_angle - np.sum(psi * coefficients, axis=0)
         total = current - seen - self._need + load
@@ -114,7 +114,3 @@ class RunningAngleLoad:
         self._gram = self._gram + learns * psi[:, None] * psi
         self._right += learns * psi * (seen - self._excess)
         return LoadAndCurrent(load, bounded)
-
-    def _coefficients(self) -> Array:
-        """Solve the normal equations of c, two by two."""
-        return np.linalg.solve(self._gram.transpose(2, 0, 1), self._right.T[..., None])[..., 0].T

@@ -92,10 +92,6 @@ class Runtime:
         limits = self.limits()
         return limits.get("lower", np.full(n, -np.inf))[:n], limits.get("upper", np.full(n, np.inf))[:n]
 
-    def limited_states(self, n: int) -> list[int]:
-        """Return which of n states have limits."""
-        return np.flatnonzero(np.isfinite(self.sides(n)).any(axis=0)).tolist()
-
     def binds(self, x: Array) -> bool:
         """Whether an estimate, (n,), meets a limit."""
         low, high = self.sides(len(x))

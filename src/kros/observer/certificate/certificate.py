@@ -113,9 +113,9 @@ class ReliftCertificate(Storable):
         """Return the error dynamics that the certificate is about."""
         return error_system(observer, self.scales, self.box, self.parameters)
 
-    def in_sizes(self, observer: ObserverData, sizes: Mapping[str, float]) -> ReliftCertificate:
-        """Return what the certificate of an observer says of the same observer for signals divided by other sizes."""
-        x, u = factors(observer, sizes)
+    def in_units(self, observer: ObserverData) -> ReliftCertificate:
+        """Return what the certificate of an observer says of the same observer in the units of the recordings."""
+        x, u = factors(observer, {})
         n, lifting = observer.lifting.n_states, observer.lifting
         names = (*lifting.states, *observer.inputs)
         by_name = dict(zip(names, np.concatenate([x[:n], u[: len(observer.inputs)]]), strict=True))
@@ -204,10 +204,11 @@ def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None
         found.append(f"true and estimated state stay within {_ranges(box)}")
     found.append("every measurement arrives")
     limits, names = observer.runtime, observer.lifting.states
+    limited = np.isfinite(limits.sides(len(names))).any(axis=0)
     if limits.delay:
         found.append(f"measurements arrive {limits.delay} samples late")
-    if clips := limits.limited_states(len(names)):
-        found.append(f"the true {', '.join(names[i] for i in clips)} stays within the limits of the estimate")
+    if clips := [name for name, at in zip(names, limited, strict=True) if at]:
+        found.append(f"the true {', '.join(clips)} stays within the limits of the estimate")
     if observer.seen is not None:
         found.append("no measurement and no input is refused as implausible")
     return tuple(found)

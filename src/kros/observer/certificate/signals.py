@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike, Flags, Parameters, Whole
+from ...core.arrays import Array, Flags, Parameters, Whole
 from ...core.rounding import AGREED, TINY
 from ...data import EpisodeBatch
 from ...loops.filtering import recursion
@@ -37,7 +37,7 @@ _OTHERS = (0.0, 1e-3)  # weights of other states' errors: with them the Riccati 
 
 @dataclass(frozen=True, eq=False)
 class SignalBound:
-    """Bounds on the errors of one observer at run time, in the states' own units of measure."""
+    """Bounds on the errors of one observer at run time, in the units of measure of the batch."""
 
     states: tuple[str, ...]  # of the recordings
     units: tuple[str, ...]
@@ -83,11 +83,6 @@ class SignalBound:
             "set_bound_to_error_max": max(finite, default=None),
             "set_outside": list(self.outside),
         }
-
-    def in_sizes(self, factors: ArrayLike) -> SignalBound:
-        """Return the same for states in other units of measure, by their factors, shape (n,)."""
-        by = np.asarray(factors, dtype=float)
-        return replace(self, **{name: getattr(self, name) * by for name in ("bounds", "errors", "sizes")})
 
 
 def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: EpisodeBatch) -> SignalBound:

@@ -207,7 +207,7 @@ def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None
     limited = np.isfinite(limits.sides(len(names))).any(axis=0)
     if limits.delay:
         found.append(f"measurements arrive {limits.delay} samples late")
-    if clips := [name for name, at in zip(names, limited, strict=True) if at]:
+    if clips := [names[i] for i in np.flatnonzero(limited)]:
         found.append(f"the true {', '.join(clips)} stays within the limits of the estimate")
     if observer.seen is not None:
         found.append("no measurement and no input is refused as implausible")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 AnyArray = NDArray[Any]
 Array = NDArray[np.float64]
+Bits = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
 Parameters = Mapping[str, ArrayLike]  # of a lifting, by name

@@ -27,14 +27,12 @@ from enum import IntFlag
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..core.arrays import Array, ArrayLike, Flags, Index
+from ..core.arrays import Array, ArrayLike, Bits, Flags, Index
 from ..core.errors import DimensionError
 from .data import ObserverData
 from .runtime import Seen
 
-Bits = npt.NDArray[np.uint8]
 BEYOND = 1.5  # times the range: what is further away is implausible
 _SIGNALS = ("y", "u", "status", "starts", "complete")
 LONGEST = 5  # samples for which an input may be held without a new start

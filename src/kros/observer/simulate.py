@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, Index, Parameters
+from ..core.arrays import Array, Bits, Flags, Index, Parameters
 from ..loops import Library, formulas, library
 from .data import ObserverData
 from .monitor import judged_samples
 from .runtime import bounds
-from .screen import Bits, Held, SampleStatus, Screened, screened
+from .screen import Held, SampleStatus, Screened, screened
 from .step import Steps, forward
 
 _ROWS = 1000  # samples predicted forward at a time

@@ -16,16 +16,8 @@ import argparse
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
-from sklearn.base import clone
-from sklearn.compose import TransformedTargetRegressor
-from sklearn.ensemble import HistGradientBoostingRegressor
-from sklearn.neural_network import MLPRegressor
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 import kros
 from kros.data import EpisodeBatch, Population, split_episodes
@@ -33,13 +25,11 @@ from kros.design.baselines import make_learned
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import EstimatorSettings, Recordings, identify_estimator, run_observer
+from kros.observer.baselines.trained import Rows
 from kros.study import Stage, load_config
 
 METHODS = ("estimator", "ridge", "boosting", "network")
 START = 50  # samples
-DELAYS = (1, 2, 3, 5, 8, 12, 20, 30, 50, 70, 100)  # samples
-AVERAGES = (0.003, 0.01, 0.03, 0.1, 0.3)  # time constants, shares of the median episode
-ROWS = 60_000
 
 
 def main() -> None:
@@ -77,7 +67,8 @@ def errors(
     observer = identify_estimator(
         "estimator", lifting, measured, population.inputs, recordings, population.sample_period_s, settings=settings
     ).observer
-    ridge, regressors = make_learned(training, measured), regressors_of(training, measured, hidden, recordings)
+    ridge, collected = make_learned(training, measured), Rows.of(training.one_by_one(), measured, recordings.lengths)
+    regressions = [collected.fitted("boosting"), collected.fitted("network")]
     test = [k for split in split_episodes(population.select([unit])).values() for k in split.test]
     rows = []
     for batch in (EpisodeBatch.read(population, [key]) for key in test):
@@ -86,41 +77,10 @@ def errors(
             run_observer(observer, y, batch.inputs)[:, 0][:, hidden],
             ridge.estimate(batch.keys, y, batch.inputs, {})[:, 0][:, hidden],
         ]
-        X = features(y[:, 0], batch.inputs[:, 0], recordings.length)
-        runs += [np.column_stack([model.predict(X) for model in models]) for models in regressors]
+        runs += [regression.run(y, batch.inputs)[:, 0][:, hidden] for regression in regressions]
         squares = np.array([(run - truth) ** 2 for run in runs])
         rows.append(np.sqrt([squares.mean(axis=1), squares[:, :START].mean(axis=1)]))
     return np.mean(rows, axis=0).swapaxes(0, 1)
-
-
-def features(y: np.ndarray, u: np.ndarray, length: float) -> np.ndarray:
-    """Return what scikit-learn's rivals see at every sample, of the samples before it."""
-    v = np.concatenate([y, u], axis=1)
-    v = np.concatenate([v[:1], v[:-1]])
-    parts = [v, np.broadcast_to(v[0], v.shape), np.minimum(np.arange(len(v)), length)[:, None] / length]
-    parts += [v - v[np.maximum(np.arange(len(v)) - delay, 0)] for delay in DELAYS]
-    for share in AVERAGES:
-        a = np.exp(-1 / (share * length))
-        parts.append(lfilter([1 - a], [1, -a], v, axis=0, zi=a * v[:1])[0])
-    return np.hstack(parts)
-
-
-def regressors_of(
-    training: TrainingSet, measured: tuple[int, ...], hidden: list[int], recordings: Recordings
-) -> list[list[Any]]:
-    """Return gradient boosting and a network for every hidden state, fitted to thinned rows."""
-    step = max(1, sum(recordings.lengths) // ROWS)
-    X, T = [], []
-    for number, key in enumerate(recordings.keys):
-        batch = recordings.read(key)
-        some = slice(number % step, int(batch.lengths[0]), step)
-        X.append(features(batch.measurements(measured)[:, 0], batch.inputs[:, 0], recordings.length)[some])
-        T.append(batch.states[some, 0][:, hidden])
-    rows, targets = np.vstack(X), np.vstack(T)
-    boosting = HistGradientBoostingRegressor(max_iter=500, early_stopping=True, random_state=0)
-    network = MLPRegressor(hidden_layer_sizes=(64, 64), early_stopping=True, max_iter=300, random_state=0)
-    scaled = TransformedTargetRegressor(make_pipeline(StandardScaler(), network), transformer=StandardScaler())
-    return [[clone(model).fit(rows, target) for target in targets.T] for model in (boosting, scaled)]
 
 
 def show(population: Population, name: str, hidden: list[int], found: np.ndarray) -> None:

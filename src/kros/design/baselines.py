@@ -17,6 +17,7 @@ from ..observer import Seen
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from ..observer.baselines.learned import Moments, Ridge
+from ..observer.baselines.trained import Regressor, Rows
 from ..observer.residual import like_measurement_noise, one_step_covariance, one_step_residual
 from ..observer.screen import Screen
 from ..observer.sensor import delay_of
@@ -29,6 +30,7 @@ class BaselineSettings:
 
     levels: tuple[float, ...] = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of the extended filter's process noise
     extended_samples: int = 2_000  # of an episode, on which these are compared
+    folds: int = 4  # of units, each estimated by a regression of scikit-learn that does not know it
     same_motion: float = 0.01  # RMS difference of inputs of the same motion, share of the largest input
 
 
@@ -122,6 +124,17 @@ def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "the unit under test"}
     estimators = {unit: moments.estimator([unit]) for unit in moments.units} | {"": moments.estimator()}
     return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)
+
+
+def make_trained(training: TrainingSet, measured: tuple[int, ...], kind: Regressor) -> Baseline:
+    """Train a regression of scikit-learn on whole training episodes of all units, and without each fold of them."""
+    lengths = [len(batch.states) for batch in training.one_by_one()]
+    rows = Rows.of(training.one_by_one(), measured, lengths)
+    units = sorted(training.parameters)
+    folds = [units[k :: DEFAULT.folds] for k in range(min(DEFAULT.folds, len(units)))]
+    by_unit = {unit: one for fold in folds for one in [rows.fitted(kind, fold)] for unit in fold}
+    facts = {"status": "trained", "episodes": len(training.keys), "left_out": "units of the fold under test"}
+    return Baseline(by_unit | {"": rows.fitted(kind)}, measured, rows.estimated, facts, seen=training.seen)
 
 
 @dataclass(frozen=True, eq=False)

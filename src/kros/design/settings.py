@@ -9,7 +9,9 @@ from pydantic import Field
 from ..core.settings import Settings
 
 METHODS = Literal["mixed", "paper", "worst_case_h2", "residual_h2", "estimator"]
-BASELINES = Literal["open_loop", "kalman_tuned", "ekf", "filtered_difference", "learned", "mean_profile"]
+BASELINES = Literal[
+    "open_loop", "kalman_tuned", "ekf", "filtered_difference", "learned", "mean_profile", "boosting", "network"
+]
 
 
 class SynthesisSettings(Settings):
@@ -25,7 +27,10 @@ class ObserverSettings(Settings):
     """Which observers are compared.
 
     The extended Kalman filter runs on the first lifted model (on a linear one it is the tuned Kalman filter);
-    ``filtered_difference``, ``learned`` and ``mean_profile`` need no model.
+    ``filtered_difference``, ``learned`` and ``mean_profile`` need no model. ``boosting`` and ``network`` are trained by
+    scikit-learn, on demand: they take minutes.
     """
 
-    baselines: tuple[BASELINES, ...] = Field(get_args(BASELINES), description="observers to compare with")
+    baselines: tuple[BASELINES, ...] = Field(
+        get_args(BASELINES)[:-2], description="observers to compare with; boosting and network on demand"
+    )

@@ -27,6 +27,8 @@ METHODS = {
     "filtered_difference": Method("filtered difference", "low-pass filtered derivative", Tone.GOLD, True),
     "learned": Method("learned", "ridge regression on past samples", Tone.GREEN, True),
     "mean_profile": Method("mean profile", "mean of the same episode of other units", Tone.GREEN, True),
+    "boosting": Method("boosting", "gradient boosting on past samples", Tone.GREEN, True),
+    "network": Method("network", "neural network on past samples", Tone.GREEN, True),
     "mixed": Method("mixed H2-H∞", "H2-optimal with an H∞ bound", Tone.ORANGE),
     "paper": Method("mixed, entrywise weights", "as published", Tone.ORANGE),
     "worst_case_h2": Method("worst-case H2", "smallest H2 norm over the set of plants", Tone.BLUE),
@@ -100,7 +102,7 @@ def model_look(name: str) -> Look:
 
 def method_look(name: str) -> Look:
     """Return how an observer's curves look beside others of the same model: the hue of its method."""
-    styles = {"kalman_tuned": "--", "mean_profile": ":", "estimator": "-."}
+    styles = {"kalman_tuned": "--", "mean_profile": ":", "boosting": "--", "network": "-.", "estimator": "-."}
     return Look(method_of(name).tone.light, styles.get(split_observer(name)[1], "-"))
 
 

@@ -137,7 +137,7 @@ def bounded(observer: Observer, recordings: Recordings, room: float) -> Runtime:
     """Return limits of the estimates of hidden states: their ranges in training, widened by a share."""
     low, high = recordings.ranges
     lower, upper = (np.full(observer.lifting.n_states, end) for end in (-np.inf, np.inf))
-    hidden = [i for i in range(len(low)) if i not in observer.measured]
+    hidden = [i for i in range(len(recordings.size)) if i not in observer.measured]
     lower[hidden], upper[hidden] = (low - room * (high - low))[hidden], (high + room * (high - low))[hidden]
     return Runtime(0, lower, upper)
 
@@ -151,7 +151,10 @@ def best_family(
     hidden: Sequence[int],
 ) -> tuple[Readout, str]:
     """Return the readout of the first family after which the next is not better by the margin on left-out units."""
-    ranges = ranges_of(lifting, measured, inputs, recordings, settings)
+    names, n = [*lifting.states, *inputs], lifting.n_states
+    ends = (lifting.sizes_of(names) * recordings.ranges).T.tolist()
+    known = [*measured, *range(n, len(names))]
+    ranges = {names[i]: (ends[i][0], ends[i][1]) for i in known}
     best: list[tuple[Readout, str]] = []
     for family in FAMILIES:
         design = Design.of(channels_of(lifting, measured, inputs, family, ranges, settings), recordings, settings)
@@ -162,21 +165,6 @@ def best_family(
             break
         best.append((readout, family))
     return best[-1]
-
-
-def ranges_of(
-    lifting: Lifting,
-    measured: Sequence[int],
-    inputs: Sequence[str],
-    recordings: Recordings,
-    settings: EstimatorSettings,
-) -> dict[str, tuple[float, float]]:
-    """Return the least and largest value of measured states and inputs in the units that formulas are written in."""
-    names = [*(lifting.states[i] for i in measured), *inputs]
-    batches = [recordings.read(key) for key in recordings.some(settings.episodes).keys]
-    values = np.vstack([np.concatenate([b.measurements(measured), b.inputs], axis=-1)[:, 0] for b in batches])
-    ends = lifting.sizes_of(names) * [np.nanmin(values, axis=0), np.nanmax(values, axis=0)]
-    return dict(zip(names, map(tuple, ends.T.tolist()), strict=True))
 
 
 def assembled(

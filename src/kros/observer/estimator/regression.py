@@ -55,8 +55,8 @@ class Recordings:
         Returns the `EpisodeBatch` of one key.
     size : ndarray, shape (n,)
         Sizes of the recorded states.
-    ranges : tuple of ndarray, shape (n,)
-        Their least and largest values.
+    ranges : tuple of ndarray, shape (n + m,)
+        Least and largest values of states and inputs.
     bias : ndarray, optional
         Offsets of the measured states that their sensors may have at run time, of either sign, shape (q,).
 
@@ -81,12 +81,16 @@ class Recordings:
     @classmethod
     def of(cls, keys: Sequence[EpisodeKey], read: Read, bias: Array | None = None) -> Recordings:
         """Return the episodes with their lengths and the sizes of their states."""
-        batches = [read(key) for key in keys]
-        low = np.min([b.states[: b.lengths[0]].min(axis=(0, 1)) for b in batches], axis=0)
-        high = np.max([b.states[: b.lengths[0]].max(axis=(0, 1)) for b in batches], axis=0)
-        size = np.maximum(np.abs(low), np.abs(high))
+        lengths, lows, highs, n = list[int](), list[Array](), list[Array](), 0
+        for batch in map(read, keys):
+            values, n = np.concatenate([batch.states, batch.inputs], axis=-1)[:, 0], batch.states.shape[-1]
+            lengths.append(len(values))
+            lows.append(values.min(axis=0))
+            highs.append(values.max(axis=0))
+        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+        size = np.maximum(np.abs(low), np.abs(high))[:n]
         size[size == 0] = 1.0
-        return cls(tuple(keys), tuple(int(b.lengths[0]) for b in batches), read, size, (low, high), bias)
+        return cls(tuple(keys), tuple(lengths), read, size, (low, high), bias)
 
     @property
     def length(self) -> float:

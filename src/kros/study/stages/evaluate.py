@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +14,13 @@ import numpy.typing as npt
 from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
 from ...data.population import EpisodeKey
-from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile
+from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
 from ...evaluate.held_out import HeldOut, Outcome, alike
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
+from ...observer.baselines.trained import Regressor
 from ...observer.sensor import sides
 from ..engine.context import Context
 from .load import run_load
@@ -106,6 +107,7 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     profile = partial(make_mean_profile, whole, first.measured, episodes.population, episodes.keys)
     makers["filtered_difference"] = partial(make_difference, training, first.measured)
     makers |= {"mean_profile": profile, "learned": partial(make_learned, whole, first.measured)}
+    makers |= {kind: partial(make_trained, whole, first.measured, kind) for kind in get_args(Regressor)}
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
 
 

@@ -19,10 +19,11 @@ from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
-from ..text import plain, plain_names
+from ..text import plain, plain_names, require_identifier
 from .origin import OriginShift, find_shift
 from .realise import RULE, realised
 
+TOLERANCE = {"double": 1e-9, "float": 1e-3}  # of golden vectors
 DOUBLE, SINGLE = Precision(), Precision("float")
 
 
@@ -65,6 +66,11 @@ class Source:
         cls, observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None
     ) -> Source:
         """Look at an observer; refuse what it cannot give."""
+        require_identifier(name)
+        for parameter in observer.lifting.parameters:
+            require_identifier(parameter, "parameter")
+        if precision not in TOLERANCE:
+            raise ConfigError(f"Export: precision should be {' or '.join(TOLERANCE)}, found {precision!r}.")
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
             raise ConfigError(f"Export: load torque needs {', '.join(missing)}, found {', '.join(observer.recorded)}.")
         observer = realised(observer)

@@ -68,7 +68,13 @@ def _part(kind: Any) -> Any:
     return create_model(f"_{kind.__name__}", __base__=_Part, **held)
 
 
-_PARTS: dict[str, Any] = {"seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
+_PARTS: dict[str, Any] = {
+    "runtime": Runtime,
+    "seen": Seen,
+    "filter_bank": FilterBank,
+    "guard": Guard,
+    "monitor": Monitor,
+}
 
 
 def _field(key: str) -> str:
@@ -94,7 +100,7 @@ class _File(_Part):
     about: dict[str, Any] = Field(default_factory=dict)
 
 
-_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in {**_PARTS, "runtime": Runtime}.items()}
+_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
 _Whole = create_model("_Whole", __base__=_File, **_KINDS)
 
 
@@ -116,8 +122,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "sample_period_s": observer.sample_period_s,
         "model": {"A": observer.A, "B": observer.B},
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
-        "runtime": {"delay": observer.runtime.delay, **observer.runtime.limits()},
-        **{key: vars(part) for key, part in parts.items() if part is not None},
+        **{key: _given(vars(part)) for key, part in parts.items() if part is not None},
         "sensor": {name: sensor.model_dump() for name, sensor in observer.sensor.items()},
         "about": observer.about,
     }
@@ -170,8 +175,10 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
     order, width = len(content["controller"]["A"]), m if content["injection"] == Injection.INPUT.value else n
     shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
     A, B, C, D = (_matrix(content["controller"][key], shape, f"controller.{key}") for key, shape in shapes.items())
-    given = {key: content[key] for key in _PARTS if content[key] is not None}
-    parts = {_field(k): _PARTS[k](**{f: v for f, v in part.items() if v is not None}) for k, part in given.items()}
+    given = {key: _given(part) for key, part in _given({key: content[key] for key in _PARTS}).items()}
+    for name, end in (("lower", -np.inf), ("upper", np.inf)):
+        if name in (runtime := given.get("runtime", {})):
+            runtime[name] = [end if limit is None else limit for limit in runtime[name]]
     return ObserverData(
         content["name"],
         lifting,
@@ -183,11 +190,15 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         content["injection"],
         content["sample_period_s"],
         {name: value for name, value in content["parameters"].items() if value is not None},
-        Runtime.from_content(content["runtime"] or {}),
         sensor={name: Sensor.of(value, f"sensor.{name}") for name, value in content["sensor"].items()},
         about=content["about"],
-        **parts,
+        **{_field(key): _PARTS[key](**part) for key, part in given.items()},
     )
+
+
+def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields that are not null."""
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def _matrix(rows: Matrix, shape: tuple[int, int], where: str) -> Array:

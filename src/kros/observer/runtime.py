@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -100,13 +98,6 @@ class Runtime:
     def clip_estimate(self, x: Array, out: Array | None = None) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
         return np.clip(x, *self.sides(x.shape[-1]), out=out) if self.limits() else x
-
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any]) -> Runtime:
-        """Read the fields that a file holds; null stands for what is infinite."""
-        ends = {name: end for name, end in (("lower", -np.inf), ("upper", np.inf)) if content.get(name)}
-        limits = {name: np.nan_to_num(np.array(content[name], dtype=float), nan=end) for name, end in ends.items()}
-        return cls(content.get("delay") or 0, **limits)
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,19 +73,6 @@ class Lifting:
         """Rebuild from the texts in a worker process: programs do not travel."""
         return Lifting, tuple(getattr(self, f.name) for f in fields(self))
 
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any]) -> Lifting:
-        """Rebuild a lifting from ``states``, ``lifting``, ``parameters`` and what `extension` gave."""
-        names = ("states", "lifting", "parameters", "lifting_inputs", "input_functions")
-        sizes = tuple((name, float(size)) for name, size in content.get("sizes", ()))
-        states, functions, parameters, inputs, input_functions = (tuple(content.get(name, ())) for name in names)
-        return cls(states, functions, parameters, inputs, input_functions, sizes)
-
-    def extension(self) -> dict[str, Any]:
-        """Return what an artifact has to hold besides states, functions and parameters; nothing for a plain lifting."""
-        extra = {"lifting_inputs": self.inputs, "input_functions": self.input_functions, "sizes": self.sizes}
-        return {name: value for name, value in extra.items() if value}
-
     def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
         """Return the lifting for channels and functions divided by sizes; formulas stay as they are written.
 
@@ -168,7 +155,15 @@ class Lifting:
 
     def windows(self, x: Array, u: Array) -> Array:
         """Return the windows of a recording, shape (..., n_samples - history, n_window), from sample `history` on."""
-        return self.window.slide(x, u)
+        window = self.window
+        window.require_inputs(u)
+        if not window.depths:
+            return x
+        window.require(x.shape[-2])
+        columns, names = np.concatenate([x, u], axis=-1), (*self.states, *self.inputs)
+        h, end = window.history, x.shape[-2]
+        earlier = [columns[..., h - d : end - d, names.index(q)] for q, d in window.delayed]
+        return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
 
     def parameter_values(self, parameters: Parameters | None = None) -> dict[str, Array]:
         """Return the values of all parameters, refusing to go on where one is missing."""

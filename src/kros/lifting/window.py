@@ -85,17 +85,6 @@ class Window:
         padding = np.zeros((*x.shape[:-1], len(self.earlier)))
         return np.concatenate([x, padding, u], axis=-1)[..., self.present]
 
-    def slide(self, x: Array, u: Array) -> Array:
-        """Return the windows of a recording, shape (..., n_samples - history, n_window), from sample `history` on."""
-        self.require_inputs(u)
-        if not self.depths:
-            return x
-        self.require(x.shape[-2])
-        columns, names = np.concatenate([x, u], axis=-1), (*self.states, *self.inputs)
-        h, end = self.history, x.shape[-2]
-        earlier = [columns[..., h - d : end - d, names.index(q)] for q, d in self.delayed]
-        return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
-
     def require(self, n_samples: int, beyond: int = 0) -> None:
         """Refuse a recording that is shorter than the history and `beyond` samples after its first window."""
         needed = self.history + 1 + beyond

@@ -31,6 +31,7 @@ from .sensor import Sensor
 
 log = logging.getLogger(__name__)
 SCHEMA, KIND = 3, "observer"
+_PERHAPS = ("lifting_inputs", "input_functions", "sizes", "sensor", "about")  # absent where they are empty
 Name = Annotated[str, Field(min_length=1)]
 Row = list[float]
 Matrix = list[Row]
@@ -114,7 +115,9 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "name": observer.name,
         "states": lifting.states,
         "lifting": lifting.functions,
-        **lifting.extension(),
+        "lifting_inputs": lifting.inputs,
+        "input_functions": lifting.input_functions,
+        "sizes": lifting.sizes,
         "parameters": {k: observer.parameters.get(k) for k in lifting.parameters},
         "inputs": observer.inputs,
         "measured": observer.measured,
@@ -127,7 +130,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "about": observer.about,
     }
     written: dict[str, Any] = plain(content)
-    return {key: value for key, value in written.items() if value or key not in ("sensor", "about")}
+    return {key: value for key, value in written.items() if value or key not in _PERHAPS}
 
 
 def write_observer(observer: ObserverData, path: Path) -> None:
@@ -166,7 +169,10 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         raise DataError(
             f"the names of states, inputs and parameters should differ, found {', '.join(twice)} more than once."
         )
-    lifting, measured = Lifting.from_content(content), tuple(content["measured"])
+    keys = ("states", "lifting", "parameters", "lifting_inputs", "input_functions")
+    states, functions, parameters, inputs, gamma = (tuple(content[key]) for key in keys)
+    sizes = tuple((name, float(size)) for name, size in content["sizes"])
+    lifting, measured = Lifting(states, functions, parameters, inputs, gamma, sizes), tuple(content["measured"])
     if len(set(measured)) < len(measured) or not set(measured) <= set(range(lifting.n_states)):
         raise DataError(
             f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {list(measured)}."

@@ -79,7 +79,7 @@ def test_the_certificate_says_the_same_in_other_sizes():
     error = np.array([0.4, -0.3])
     V = [c.root @ c.start[:, :2] @ e for c, e in ((told, error), (found, error / [2.0, 3.0]))]
     np.testing.assert_allclose(V[0] @ V[0], V[1] @ V[1])
-    assert told.system(one).corner(np.ones(1))[0].shape == (3, 3)
+    assert told.system(one).frozen(np.ones(1)).A.shape == (3, 3)
 
 
 def signals(seed=3):

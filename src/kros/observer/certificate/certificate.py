@@ -18,9 +18,10 @@ import numpy as np
 
 from ...core.arrays import Array
 from ...core.artifacts import Storable
+from ...lifting.intervals import Box
 from ..data import ObserverData
 from ..units import factors
-from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
+from .error import ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
 from .proof import first_proof, frozen_gain, growing_place
 
 

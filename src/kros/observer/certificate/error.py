@@ -22,9 +22,8 @@ d_k       : position of every slope in its interval
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -34,10 +33,9 @@ from ...core.linalg import floats
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ROUNDING
 from ...lifting.formula import delayed_name
-from ...lifting.intervals import break_of, slope_bounds_of
+from ...lifting.intervals import Box, break_of, slope_bounds_of
 from ..data import ObserverData
 
-Box = Mapping[str, Any]
 _WIDER = 1 + 4 * EPS  # centre and half width are rounded
 _CONSTANT = 4 * ROUNDING  # interval bounds are widened by so much: a slope within that is constant
 
@@ -112,16 +110,6 @@ class ErrorSystem:
     E: Array | float = 0.0  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
     start: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n_xi, n_window): where the first error goes
 
-    def closed(self, d: ArrayLike) -> Array:
-        """Return ``(I - diag(d) E)^-1 diag(d)``, shape (n_p, n_p)."""
-        d = np.asarray(d, dtype=float)
-        return np.asarray(np.linalg.solve(np.eye(len(d)) - d[:, None] * self.E, np.diag(d)))
-
-    def corner(self, d: ArrayLike) -> tuple[Array, Array]:
-        """Return ``A + L d M`` and ``B + L d D``, d (n_p,) a place in the box."""
-        moved = self.L @ self.closed(d)
-        return self.A + moved @ self.M, self.B + moved @ self.D
-
     def multiplied(self, multipliers: Array, gain: float) -> tuple[tuple[Array, Array], Array, Array]:
         """Return (A, B), C and D with p as input and q as output: a gain proven for it holds in the whole box."""
         root = np.sqrt(multipliers)
@@ -133,8 +121,10 @@ class ErrorSystem:
         return (self.A, B), C, D
 
     def frozen(self, d: ArrayLike) -> StateSpace:
-        """Return the system from w to z with slopes that stay where they are."""
-        A, B = self.corner(d)
+        """Return the system from w to z with slopes that stay at a place d in the box, (n_p,)."""
+        d = np.asarray(d, dtype=float)
+        moved = self.L @ np.linalg.solve(np.eye(len(d)) - d[:, None] * self.E, np.diag(d))
+        A, B = self.A + moved @ self.M, self.B + moved @ self.D
         return StateSpace(A, B, self.C, np.zeros((len(self.C), B.shape[1])), self.dt)
 
     def mismatch(self) -> ErrorSystem:

@@ -63,7 +63,7 @@ class AngleLoad:
                 f"Level of a load: seen part {seen.shape}, current {current.shape} and position {position.shape} "
                 f"should all be (n_samples, batch)."
             )
-        running = self.start(position[0])
+        running = _RunningAngleLoad(self, position[0])
         rows = [running.step(*sample) for sample in zip(seen, current, position, strict=True)]
         return LoadAndCurrent(*(np.stack(column) for column in zip(*rows, strict=True)))
 
@@ -72,12 +72,8 @@ class AngleLoad:
         """What of a level is left after a sample."""
         return float(np.exp(-self.sample_period_s / self.level_s))
 
-    def start(self, position: ArrayLike) -> RunningAngleLoad:
-        """Return the same sample by sample, for machines that start at angles in rad, shape (batch,)."""
-        return RunningAngleLoad(self, np.atleast_1d(np.asarray(position, dtype=float)))
 
-
-class RunningAngleLoad:
+class _RunningAngleLoad:
     """`AngleLoad` sample by sample, for some machines at once."""
 
     def __init__(self, settings: AngleLoad, position: Array) -> None:

@@ -19,7 +19,8 @@ from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
-from kros.loops import compiler, find_compiler, library, recursion
+from kros.loops import compiler, library, recursion
+from kros.loops.compiler import find_compiler
 from kros.observer.simulate import run_innovations, run_observer, run_observers
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")

@@ -7,15 +7,7 @@ none, the callers go on in NumPy, which is also what tests compare with.
 
 from __future__ import annotations
 
-from .compiler import COMPILERS, find_compiler
 from .filtering import recursion
 from .library import Library, formulas, library
 
-__all__ = [
-    "COMPILERS",
-    "Library",
-    "find_compiler",
-    "formulas",
-    "library",
-    "recursion",
-]
+__all__ = ["Library", "formulas", "library", "recursion"]

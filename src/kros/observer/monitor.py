@@ -61,8 +61,8 @@ class Monitor:
         whole = np.all(self.weights == np.round(self.weights)) and self.weights.sum() == WEIGHT
         if not (whole and 0 < self.forget <= 1 and 0 <= self.first <= 1 and self.settle >= 0):
             raise DataError(
-                f"Monitor of an observer: weights should be whole and of sum {WEIGHT}, forget and first within 0 and 1, "
-                f"settle at least 0; found {self}."
+                f"Monitor of an observer: weights should be whole and of sum {WEIGHT}, forget and first within 0 and "
+                f"1, settle at least 0; found {self}."
             )
 
     def mean_squares(self, innovation: Array, judged: Flags) -> Array:

@@ -392,6 +392,22 @@ def figures(run_folder: Run, out: Path) -> None:
     _say([f"{len(write_figures(run_folder, out, _progress()))} figures in {out}"])
 
 
+@app.command()
+def compare(
+    run_folders: Annotated[list[Path], typer.Argument(metavar="RUN RUN...")],
+    out: Annotated[Path | None, _option("Write an HTML page.", metavar="FILE")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Show runs beside each other: settings, recordings, errors, weights, certificates."""
+    from .study.commands.summary import compare_runs
+
+    content, lines = compare_runs(run_folders, out)
+    if quiet:
+        _json(content)
+    else:
+        _say(lines)
+
+
 @app.command("list")
 def list_(run_folder: Run) -> None:
     """List the observers of a run with their errors, the best first."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -280,3 +281,30 @@ def test_drawing_leaves_pyplot_alone() -> None:
         "kros.report.plot(motors); assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_runs_are_compared_as_table_page_and_json(kros, demo, tmp_path):
+    other, page = tmp_path / "other", tmp_path / "page.html"
+    shutil.copytree(demo, other)
+    study = json.loads((other / "study.json").read_text())
+    study["evaluate"]["reserve"] += 1
+    (other / "study.json").write_text(json.dumps(study))
+    result = kros("compare", demo, other, "--out", page)
+    assert result.exit_code == 0, result.output
+    assert re.search(r"evaluate.reserve +\d+ +\d+", result.stdout)
+    assert "Errors on held-out episodes" in page.read_text()
+    content = json.loads(kros("compare", demo, other, "--json").stdout)
+    assert content["runs"] == [demo.name, "other"]
+    assert set(content["settings"]) == {"evaluate.reserve"}
+    assert all(first == second for first, second in content["errors"].values())
+
+
+def test_what_cannot_be_compared_is_refused(kros, demo, tmp_path):
+    for runs, text in (([demo], "at least two runs"), ([demo, tmp_path], "there is no study.json")):
+        result = kros("compare", *runs)
+        assert result.exit_code == 2
+        assert text in result.stderr
+    begun = tmp_path / "begun"
+    shutil.copytree(demo, begun)
+    (begun / "metrics.json").unlink()
+    assert "has not ended" in kros("compare", demo, begun).stderr

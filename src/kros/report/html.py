@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from ..core.files import write_bytes
+from .content import Section
 from .facts import Facts
 from .figures import draw
 from .files import to_svg
@@ -39,13 +40,8 @@ def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Pat
 
 def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> str:
     """Return the report as HTML."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    loader = FileSystemLoader(_TEMPLATES)
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
     facts = Facts(metrics)
     parts = [[s for make in makers if (s := make(facts)) is not None] for makers in (FIRST, EVIDENCE)]
     names = [section.figure for part in parts for section in part if section.figure]
@@ -57,16 +53,29 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
     aside = sum(row.get("group") == "outliers" for row in facts.get("units", []))
     count = f"{facts.study['units']} units" + (f" and {aside} set aside" if aside else "")
     conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
-    return environment.get_template("report.html.jinja").render(
-        name=run.study.get("name", run.folder.name),
-        subtitle=" · ".join([count, *conditions]),
-        head=judge(facts),
-        sections=parts[0],
-        evidence=parts[1],
-        figures=figures,
-        style=Markup(stylesheet()),
-        script=Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8")),
+    name, subtitle = run.study.get("name", run.folder.name), " · ".join([count, *conditions])
+    return filled(name, subtitle, parts[0], evidence=parts[1], figures=figures, head=judge(facts))
+
+
+def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) -> str:
+    """Return a page of sections; `parts` are a summary, more sections as evidence, and figures by name."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    loader = FileSystemLoader(_TEMPLATES)
+    environment = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    script = Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8"))
+    look: dict[str, Any] = {
+        "style": Markup(stylesheet()),
+        "script": script,
+        "head": None,
+        "evidence": (),
+        "figures": {},
+    }
+    template = environment.get_template("report.html.jinja")
+    return template.render(look | parts, name=name, subtitle=subtitle, sections=sections)
 
 
 def encoded(run: RunFolder, name: str) -> Encoded:

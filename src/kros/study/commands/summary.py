@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import platform
 import shutil
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from ...core.artifacts import load_artifact
+from ...core.errors import ConfigError
+from ...core.files import write_bytes
+from ...report.compare import comparison, lines, sections
 from ...report.error_tables import ErrorCell
 from ...report.facts import Facts
+from ...report.html import filled
 from ...report.verdict import judge
 from ..config import Stage
 from ..engine.store import METRICS, open_finished
@@ -88,3 +94,22 @@ def list_run(run: Path) -> list[str]:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]
             lines += [f"observers: {', '.join(names)}"]
         return [*lines, "the run has not ended; the same command of kros run goes on with it"]
+
+
+def compare_runs(runs: Sequence[Path], out: Path | None = None) -> tuple[dict[str, Any], list[str]]:
+    """Return finished runs beside each other, as content of JSON and as lines; written as a page to `out`."""
+    if len(set(runs)) < 2:
+        raise ConfigError(f"Compare: at least two runs are needed, found {len(set(runs))}; name another run folder.")
+    names = [run.name for run in runs] if len({run.name for run in runs}) == len(runs) else list(map(str, runs))
+    read = {}
+    for name, run in zip(names, runs, strict=True):
+        with open_finished(run) as (config, store):
+            if not store.path(METRICS).exists():
+                raise ConfigError(f"Run {run}: has not ended; the same command of kros run goes on with it.")
+            read[name] = config.dump(), Facts(store.metrics())
+    compared = comparison(read)
+    shown = sections(names, compared)
+    if out is not None:
+        write_bytes(out, filled(" and ".join(names), "runs beside each other", shown).encode())
+    written = ["", f"page: {out}"] if out is not None else []
+    return {"runs": names, **compared}, [line for section in shown for line in lines(section)] + written

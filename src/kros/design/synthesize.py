@@ -16,8 +16,8 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.artifacts import plain
 from ..core.errors import ConfigError, SynthesisError
 from ..core.settings import require_kind
@@ -38,7 +38,6 @@ from .task import Design, DesignTask, Method, split_name
 from .validation import TrainingSet
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

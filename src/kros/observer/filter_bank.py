@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 
 from ..core.arrays import Array, Flags
-from ..core.linalg import floats
 from ..core.rounding import ITERATED
+from .checked import floats
 
 _FORGOTTEN = ITERATED  # samples: an age whose square counts as nothing beside any half
 

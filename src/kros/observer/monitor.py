@@ -26,7 +26,7 @@ import numpy as np
 
 from ..core.arrays import AnyArray, Array, Flags
 from ..core.errors import DataError
-from ..core.linalg import floats
+from .checked import floats
 
 LARGEST = 1e3  # sizes of the innovation that count at most
 RECOVERY = 4  # samples that are not judged after one that is not good

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.arrays import Array
 from ..core.errors import DataError
-from ..core.linalg import floats
+from .checked import floats
 
 
 @dataclass(frozen=True, eq=False)

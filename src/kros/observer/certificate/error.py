@@ -29,11 +29,11 @@ import numpy as np
 
 from ...core.arrays import Array, ArrayLike
 from ...core.errors import DataError, DimensionError, KrosError
-from ...core.linalg import floats
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ROUNDING
 from ...lifting.formula import delayed_name
 from ...lifting.intervals import Box, break_of, slope_bounds_of
+from ..checked import floats
 from ..data import ObserverData
 
 _WIDER = 1 + 4 * EPS  # centre and half width are rounded

@@ -30,8 +30,7 @@ from kros.motor_drive import AngleLoad
 from kros.motor_drive.observer import LoadSettings, load_observer
 from kros.motor_drive.signals import TorqueScale, load_accuracy, low_passed, without_level
 from kros.observer import Observer, Recordings, identify_estimator, relift_certificate, run_observer
-from kros.observer.residual.models import one_step_rows
-from kros.observer.residual.one_step import one_step_residual
+from kros.observer.residual import one_step_residual, one_step_rows
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.parameters import COUNT_RAD
 from kros.synthesis import kalman

@@ -104,7 +104,7 @@ def levels(observer: Observer, recorded: TrainingSet) -> list[tuple[str, str, np
         step = np.abs(np.diff(y, axis=0, prepend=y[:1]))[..., 0]
         motion = np.cumsum(step > 0.1 * np.sqrt(np.mean(step**2)), axis=0) * dt
         for i, key in enumerate(batch.keys):
-            level = monitor.level(monitor.mean_squares(nu[:, i : i + 1], judged[:, i : i + 1])[:, 0])
+            level = monitor.level(monitor.mean_squares(nu[:, i], judged[:, i]))
             rows.append((key.unit, key.condition, level, motion[:, i]))
     return rows
 

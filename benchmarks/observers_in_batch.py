@@ -71,7 +71,7 @@ def main() -> None:
             work = partial(every, partial(side_by_side, [observer(lifting, order)] * TOGETHER))
             timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)
     A = np.pad(0.3 * rng.normal(size=(3, 4)), ((0, 1), (0, 0)))
-    extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), ("a", "b"), 0.01 * np.eye(3), np.eye(1), np.eye(3))
+    extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), 0.01 * np.eye(3), np.eye(1), np.eye(3))
     timed("extended Kalman filter", lambda: every(lambda block: extended.run(block.y, block.u, block.phase)))
     timed(
         "filtered difference",

@@ -29,7 +29,7 @@ from kros.data.readers.parquet import read_parquet
 from kros.design.methods import methods_of
 from kros.design.synthesize import _design, tasks_of
 from kros.observer import Observer, ReliftScales, relift_certificate
-from kros.observer.residual.one_step import one_step_residual
+from kros.observer.residual import one_step_residual
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage

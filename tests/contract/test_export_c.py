@@ -12,7 +12,7 @@ from machines import LIMITS, MACHINES, apart, drive, in_python, samples, watched
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, LoadOutput, export_c
 from kros.export.c99.write import Golden
-from kros.loops import find_compiler
+from kros.loops.compiler import find_compiler
 from kros.motor_drive import AngleLoad
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Werror", "-pedantic")

@@ -10,7 +10,7 @@ from machines import drive, in_python, samples
 
 from kros.core.errors import ConfigError
 from kros.export import export_fmu
-from kros.loops import find_compiler
+from kros.loops.compiler import find_compiler
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")

@@ -14,7 +14,7 @@ from kros.export.c99.numbers import Source
 from kros.export.fmu.write import fmu_files
 from kros.export.text import plain, plain_names
 from kros.lifting import Lifting
-from kros.loops import find_compiler
+from kros.loops.compiler import find_compiler
 from kros.motor_drive import AngleLoad
 
 HOSTILE = {

@@ -17,7 +17,7 @@ from kros.core.errors import DataError
 from kros.data.steps import Scale
 from kros.export import CompiledObserver
 from kros.lifting import Lifting
-from kros.loops import find_compiler
+from kros.loops.compiler import find_compiler
 from kros.observer import Observer
 from kros.observer.units import recorded_channel
 from kros.plants import PLANTS

@@ -9,7 +9,7 @@ from kros.data import EpisodeBatch
 from kros.design.methods import methods_of
 from kros.design.synthesize import tasks_of
 from kros.observer import run_observer
-from kros.observer.residual.one_step import one_step_covariance
+from kros.observer.residual import one_step_covariance
 from kros.observer.units import in_sizes
 from kros.plants import DcMotorPopulation
 

@@ -8,7 +8,7 @@ from machines import LIMITS, apart, drive, in_python, samples
 
 from kros.export import CompiledObserver, export_c
 from kros.export.c99.origin import find_shift
-from kros.loops import find_compiler
+from kros.loops.compiler import find_compiler
 from kros.observer import run_observer
 from kros.observer.runtime import Runtime
 

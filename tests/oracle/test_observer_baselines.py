@@ -28,7 +28,7 @@ def test_extended_filter_is_the_textbook_recursion_with_numerical_slopes():
     A, B = 0.2 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
     Q, R, P0 = np.diag([1e-3, 1e-2, 1e-1]), np.array([[0.02]]), np.diag([0.02, 1.0, 2.0])
     y, u, phases = rng.normal(size=(40, 2, 1)), rng.normal(size=(40, 2, 2)), np.array([0.4, -1.0])
-    found = ExtendedKalman(KOOPMAN, A, B, (0,), ("a", "b"), Q, R, P0).run(y, u, {"phase": phases})
+    found = ExtendedKalman(KOOPMAN, A, B, (0,), Q, R, P0).run(y, u, {"phase": phases})
     for i, phase in enumerate(phases):
 
         def model(x, v, phase=phase):
@@ -49,7 +49,7 @@ def test_extended_filter_of_a_linear_model_settles_at_the_riccati_gain():
     plain, Q, R = Lifting(("a", "b")), np.diag([0.3, 0.1]), np.array([[0.5]])
     y, u = rng.normal(size=(600, 1, 1)), rng.normal(size=(600, 1, 1))
     steady = Observer("k", plain, A, B, (0,), ("u",), kalman(A, np.eye(1, 2), Q, R, DT).controller, Injection.STATE, DT)
-    extended = ExtendedKalman(plain, A, B, (0,), ("u",), Q, R, start_covariance(np.array([1.0, 5.0]), R, (0,)))
+    extended = ExtendedKalman(plain, A, B, (0,), Q, R, start_covariance(np.array([1.0, 5.0]), R, (0,)))
     np.testing.assert_allclose(extended.run(y, u)[500:], run_observer(steady, y, u)[500:], atol=1e-9)
 
 
@@ -58,7 +58,7 @@ def test_extended_filter_of_late_measurements_is_that_of_punctual_ones_predicted
     A, B = 0.2 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
     Q, R, P0 = np.diag([1e-3, 1e-2, 1e-1]), np.array([[0.02]]), np.diag([0.02, 1.0, 2.0])
     y, u, phase = rng.normal(size=(30, 1, 1)), rng.normal(size=(30, 1, 2)), {"phase": np.array([0.4])}
-    punctual = ExtendedKalman(KOOPMAN, A, B, (0,), ("a", "b"), Q, R, P0)
+    punctual = ExtendedKalman(KOOPMAN, A, B, (0,), Q, R, P0)
     arrives = np.concatenate([np.repeat(y[:1], d, axis=0), y[:-d]])
     found = replace(punctual, delay=d).run(arrives, u, phase)[:, 0]
     before = punctual.run(y, u, phase)[:, 0]

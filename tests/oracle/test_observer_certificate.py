@@ -136,7 +136,8 @@ def test_brute_force_over_all_slope_sequences_stays_below_the_gain() -> None:
     found, system = relift_certificate(observer), error_system(observer)
     assert found.gain is not None
     horizon, worst = 5, 0.0
-    corners = [system.corner(d) for d in product((-1.0, 1.0), repeat=system.L.shape[1])]
+    frozen = [system.frozen(d) for d in product((-1.0, 1.0), repeat=system.L.shape[1])]
+    corners = [(one.A, one.B) for one in frozen]
     for sequence in product(range(len(corners)), repeat=horizon - 1):
         blocks = np.zeros((horizon, horizon, 3, 4))
         state = np.zeros((len(system.A), horizon, 4))

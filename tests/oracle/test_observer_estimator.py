@@ -252,6 +252,24 @@ def test_a_position_that_goes_on_for_ever_changes_nothing(reference):
         identify_estimator("motor", Lifting(names), (0,), inputs, recordings, 1e-3, settings=wrong)
 
 
+def test_estimates_stay_inside_declared_limits():
+    population = kros.plants.DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    recordings = Recordings.of(list(population.keys()), lambda key: EpisodeBatch.read(population, [key]))
+    parts = Lifting(population.states, sizes=(("current", 2.0),)), (0,), population.inputs, recordings, 1e-3
+    batch = recordings.read(recordings.keys[0])
+    top = 0.5 * float(np.abs(batch.states[..., 2]).max())
+    declared = FEW.model_copy(update={"limits": {"current": (-2 * top, 2 * top)}})  # in the recordings' unit
+    free, limited = (
+        run_observer(identify_estimator("motor", *parts, settings=one).observer, batch.measurements([0]), batch.inputs)
+        for one in (FEW, declared)
+    )
+    np.testing.assert_array_equal(limited[..., 2], np.clip(free[..., 2], -top, top))
+    np.testing.assert_array_equal(limited[..., :2], free[..., :2])
+    wrong = FEW.model_copy(update={"limits": {"torque": (0.0, 1.0)}})
+    with pytest.raises(ConfigError, match="limits should be of the states position, velocity, current"):
+        identify_estimator("motor", *parts, settings=wrong)
+
+
 def test_units_of_measure_change_nothing():
     recordings, batches = plant(units=3, spread=0.1)
     factors, u_factor = np.array([1000.0, 60.0, 0.01]), 7.0

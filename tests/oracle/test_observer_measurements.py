@@ -111,7 +111,7 @@ def test_the_extended_filter_without_measurements_is_the_kalman_recursion_withou
     x, u = plant(80, 3)
     Q, R, P0 = 0.01 * np.eye(2), np.array([[0.04]]), np.diag([0.04, 4.0])
     y = lost(x, 0.4, seed=1)
-    found = ExtendedKalman(LINEAR, A, B, (0,), ("u",), Q, R, P0).run(y, u)
+    found = ExtendedKalman(LINEAR, A, B, (0,), Q, R, P0).run(y, u)
     for i in range(3):
         state, P = np.array([y[0, i, 0], 0.0]), P0
         for k in range(len(y)):

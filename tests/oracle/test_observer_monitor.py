@@ -35,7 +35,7 @@ def test_one_machine_is_watched_as_many_at_once(machine, bound):
     observer, (y, u) = watched(machine, bound), samples(800)
     found, status = levels(observer, y, u)
     innovation, judged = run_innovations(observer, y[:, None], u[:, None], settle=observer.monitor.settle)
-    wanted = observer.monitor.level(observer.monitor.mean_squares(innovation, judged))[:, 0]
+    wanted = observer.monitor.level(observer.monitor.mean_squares(innovation[:, 0], judged[:, 0]))
     np.testing.assert_allclose(found, wanted, atol=1e-9)
     outside = (status & SampleStatus.UNCERTIFIED) > 0
     np.testing.assert_array_equal(outside, wanted > 0)
@@ -49,9 +49,9 @@ def test_bands_pass_the_power_that_their_filters_say():
     response = np.array([b * (1 - z**2) / (1 + a1 * z + a2 * z**2) for b, a1, a2 in filters])
     np.testing.assert_allclose(w[np.abs(response).argmax(axis=1)] / (2 * np.pi), 0.256 / 2.0 ** np.arange(6), atol=1e-5)
     np.testing.assert_allclose(np.abs(response).max(axis=1), 1, rtol=1e-6)
-    noise = rng.normal(size=(400_000, 1, 1))
+    noise = rng.normal(size=(400_000, 1))
     monitor = Monitor(filters, 1e-5, 0, np.ones(1), np.ones((1, 6)), np.array([[16, 0, 0, 0, 0, 0]]), 0.02)
-    powers = monitor.mean_squares(noise, np.ones((400_000, 1), dtype=bool))[-1, 0, 0]
+    powers = monitor.mean_squares(noise, np.ones(400_000, dtype=bool))[-1, 0]
     np.testing.assert_allclose(powers, np.mean(np.abs(response) ** 2, axis=1) * (1 - (1 - 1e-5) ** 400_000), rtol=0.05)
 
 
@@ -59,12 +59,12 @@ def test_in_the_beginning_mean_squares_are_means():
     """Against the mean of what was, with ten quiet samples before it; from a hundred on as an exponential mean."""
     filters, rng = octaves(), np.random.default_rng(4)
     monitor = Monitor(filters, 0.01, 0, np.ones(1), np.ones((1, 6)), np.array([[16, 0, 0, 0, 0, 0]]), 0.02, first=0.1)
-    noise, judged = rng.normal(size=(500, 1, 1)), np.ones((500, 1), dtype=bool)
-    squares = replace(monitor, forget=1.0, first=0.0).mean_squares(noise, judged)[:, 0, 0]
-    found = monitor.mean_squares(noise, judged)[:, 0, 0]
+    noise, judged = rng.normal(size=(500, 1)), np.ones(500, dtype=bool)
+    squares = replace(monitor, forget=1.0, first=0.0).mean_squares(noise, judged)[:, 0]
+    found = monitor.mean_squares(noise, judged)[:, 0]
     np.testing.assert_allclose(found[:91], np.cumsum(squares, axis=0)[:91] / (10 + np.arange(91))[:, None], rtol=1e-12)
     np.testing.assert_allclose(found[91:], 0.99 * found[90:-1] + 0.01 * squares[91:], rtol=1e-9)
-    halves = [(noise[:200, 0], judged[:200, 0]), (noise[200:, 0], judged[200:, 0])]
+    halves = [(noise[:200], judged[:200]), (noise[200:], judged[200:])]
     np.testing.assert_array_equal(np.concatenate(monitor.in_turn(halves))[:, 0], found)
 
 

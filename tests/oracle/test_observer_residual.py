@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from kros.core import StateSpace
 from kros.lifting import Lifting
-from kros.observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
+from kros.observer.residual import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 from kros.synthesis import Injection, Status, kalman
 from kros.synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
 from kros.synthesis.residual_shaped.shaping_filter import Basis, shaping_filter

@@ -118,7 +118,7 @@ def test_a_runtime_that_makes_no_sense_is_refused():
         Runtime(delay=-1)
     with pytest.raises(DataError, match="should not exceed"):
         Runtime(lower=[1.0], upper=[0.0])
-    with pytest.raises(DataError, match="not a number"):
+    with pytest.raises(DataError, match="lower should be numbers"):
         Runtime(lower=[np.nan])
     with pytest.raises(DimensionError, match=r"runtime.lower should have shape \(3,\)"):
         observer(runtime=Runtime(lower=[1.0]))
@@ -153,7 +153,7 @@ def test_phase_locked_loop_finds_the_phase_in_both_directions():
 
 def test_phase_locked_loop_finds_the_phase_of_a_simulated_drive():
     from kros.core.artifacts import plain
-    from kros.observer.residual.models import one_step_rows
+    from kros.observer.residual import one_step_rows
     from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
     simulated = HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=8.0, conditions=("noload",), seed=3).simulate()

@@ -11,7 +11,7 @@ from kros.core.lti import StateSpace
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, Runtime, relift_certificate, run_observer
 from kros.observer.baselines.difference import FilteredDifference, followed
-from kros.observer.residual.models import least_squares
+from kros.observer.residual import least_squares
 from kros.observer.units import in_sizes
 from kros.synthesis import Injection
 
@@ -70,7 +70,7 @@ def test_the_certificate_says_the_same_in_other_sizes():
         ReliftScales(np.ones(2), np.array([0.05, 0.2 / 3]), np.array([0.005])),
     )
     direct = relift_certificate(one, box, scales)
-    told = found.in_sizes(in_sizes(one, {"x": 2.0, "v": 3.0}), {})
+    told = found.in_units(in_sizes(one, {"x": 2.0, "v": 3.0}))
     assert all(found.certified for found in (direct, told))
     assert told.gain == pytest.approx(direct.gain, rel=0.02)  # a proof stops within two percent of the least gain
     assert told.assumptions == direct.assumptions
@@ -79,7 +79,7 @@ def test_the_certificate_says_the_same_in_other_sizes():
     error = np.array([0.4, -0.3])
     V = [c.root @ c.start[:, :2] @ e for c, e in ((told, error), (found, error / [2.0, 3.0]))]
     np.testing.assert_allclose(V[0] @ V[0], V[1] @ V[1])
-    assert told.system(one).corner(np.ones(1))[0].shape == (3, 3)
+    assert told.system(one).frozen(np.ones(1)).A.shape == (3, 3)
 
 
 def signals(seed=3):

@@ -13,7 +13,7 @@ from kros.design.synthesize import measurement_noise
 from kros.evaluate.sensor import as_arriving, as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Sensor
-from kros.observer.sensor import require_measured
+from kros.observer.sensor import in_units, require_measured
 from kros.observer.simulate import run_observers
 from kros.observer.units import in_sizes
 from kros.study.config import validate_config
@@ -84,7 +84,10 @@ def test_units_of_measure_change_nothing():
     scaled = batch_of(batch.states / 4.0, batch.inputs, DT)
     y = as_shown(batch, {"position": own}, STATES).measurements((0,))
     np.testing.assert_allclose(
-        as_shown(scaled, {"position": own.in_unit(4.0)}, STATES).measurements((0,)) * 4, y, rtol=0, atol=1e-12
+        as_shown(scaled, in_units({"position": own}, {"position": 4.0}), STATES).measurements((0,)) * 4,
+        y,
+        rtol=0,
+        atol=1e-12,
     )
 
 

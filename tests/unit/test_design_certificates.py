@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from batches import batch_of
 
-from kros.core.errors import DimensionError, SynthesisError
+from kros.core.errors import DataError, DimensionError, SynthesisError
 from kros.core.lti import gain
 from kros.design.certificates import certify_model, guards_of
 from kros.design.synthesize import choose_deployed
@@ -81,7 +81,7 @@ def test_typical_scales_give_the_residual_of_a_population_unit_power() -> None:
 def test_wrong_scales_are_refused() -> None:
     with pytest.raises(DimensionError, match="needs 1 errors"):
         relift_certificate(observer("sine", "sin(x)", 0.1), scales=ReliftScales(np.ones(2), np.ones(1), np.ones(1)))
-    with pytest.raises(DimensionError, match="finite sizes above zero"):
+    with pytest.raises(DataError, match="error should be positive"):
         ReliftScales(np.zeros(1), np.ones(1), np.ones(1))
 
 

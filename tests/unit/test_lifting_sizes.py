@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 
 from kros.lifting import Lifting
+from kros.observer import Observer
 
 FULL = Lifting(
     ("position", "velocity"),
@@ -48,14 +49,11 @@ def test_boxes_are_in_the_same_sizes():
     )
 
 
-def test_sizes_travel_between_processes_and_into_files():
-    scaled = FULL.in_sizes(SIZES)
+def test_sizes_travel_between_processes_and_into_files(tmp_path):
+    scaled, path = FULL.in_sizes(SIZES), tmp_path / "observer.json"
     assert pickle.loads(pickle.dumps(scaled)) == scaled
-    content = {
-        "states": scaled.states,
-        "lifting": scaled.functions,
-        "parameters": scaled.parameters,
-        **scaled.extension(),
-    }
-    assert Lifting.from_content(content) == scaled
-    assert "sizes" not in FULL.extension()
+    for lifting in (scaled, FULL):
+        n, m = lifting.n_lifted, len(lifting.inputs) + len(lifting.input_functions)
+        Observer.open_loop("o", lifting, np.eye(n), np.ones((n, m)), (0,), lifting.inputs, 0.01).save(path)
+        assert Observer.load(path).lifting == lifting
+    assert "sizes" not in path.read_text()

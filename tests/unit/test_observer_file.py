@@ -162,7 +162,7 @@ def test_a_filter_bank_goes_through_its_file(tmp_path: Path) -> None:
     ("changes", "error", "match"),
     [
         ({"forget": np.array([1.5])}, DataError, "between 0 and 1"),
-        ({"half": np.zeros(1)}, DataError, "half positive"),
+        ({"half": np.zeros(1)}, DataError, "half should be positive"),
         ({"start": np.ones((2, 5))}, DimensionError, "start"),
         ({"filters": 4}, DimensionError, "at most 1 filters"),
     ],

@@ -5,7 +5,7 @@ import pytest
 
 from kros.core import DataError, SynthesisError
 from kros.lifting import Lifting
-from kros.observer.residual.one_step import one_step_residual, residual_spectra
+from kros.observer.residual import one_step_residual, residual_spectra
 from kros.synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
 
 A, C, NOISE, SCALE, DT = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[1.0, 0.0]]), [1e-3], [1.0, 1.0], 1e-2

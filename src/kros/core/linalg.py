@@ -18,12 +18,6 @@ def adjoint(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.asarray(np.conj(np.swapaxes(matrices, -1, -2)))
 
 
-def floats(part: Any, *names: str) -> None:
-    """Make fields of a frozen dataclass arrays of numbers, of one dimension at least."""
-    for name in names:
-        object.__setattr__(part, name, np.atleast_1d(np.asarray(getattr(part, name), dtype=float)))
-
-
 def radius_text(value: float) -> str:
     """Return a spectral radius as text, with enough digits to differ from one, for example ``1 - 2.5e-08``."""
     distance = 1 - value

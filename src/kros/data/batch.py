@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import DataError
-from .population import Array, EpisodeKey, Population
+from .population import EpisodeKey, Population
 from .recording import some
 
 

@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ValidationError
 
+from ..core.arrays import Array
 from ..core.artifacts import digest_of, united
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened, stamp_of
 from .population import (
-    Array,
     Channel,
     EpisodeKey,
     Population,

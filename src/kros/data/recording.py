@@ -19,10 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core import limits
+from ..core.arrays import Array
 from ..core.errors import DataError
 from ..core.files import shortened
 from ..core.rounding import AGREED, ROUNDING
-from .population import OUTLIERS, Array, Channel, EpisodeKey, Population, Role
+from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 
 @dataclass(frozen=True)

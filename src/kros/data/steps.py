@@ -30,10 +30,11 @@ import numpy as np
 from pydantic import ConfigDict
 
 from ..core import limits
+from ..core.arrays import Array
 from ..core.errors import ConfigError, DataError
 from ..core.files import did_you_mean
 from ..core.removed import refusing
-from .population import Array, Channel, Role, Scalings, scaling_of
+from .population import Channel, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim"]

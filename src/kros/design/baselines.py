@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Parameters
 from ..core.errors import ConfigError, DataError, SynthesisError
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
@@ -16,16 +16,12 @@ from ..identify import ModelSet
 from ..observer import Seen
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
-from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.baselines.trained import Regressor, Rows
-from ..observer.residual.one_step import one_step_covariance, one_step_residual
+from ..observer.residual import like_measurement_noise, one_step_covariance, one_step_residual
 from ..observer.screen import Screen
 from ..observer.sensor import delay_of
 from .validation import TrainingSet, rank
-
-Array = npt.NDArray[np.float64]
-Parameters = Mapping[str, Array]
 
 
 @dataclass(frozen=True)
@@ -44,7 +40,7 @@ DEFAULT = BaselineSettings()
 class Estimator(Protocol):
     """What can be run over a batch of episodes."""
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Return estimates, shape (n_samples, batch, n)."""
 
 
@@ -56,10 +52,9 @@ class Baseline:
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
-    limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
 
-    def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
+    def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Mapping[str, Array]) -> Array:
         """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
         units: dict[str, list[int]] = {}
         for i, key in enumerate(keys):
@@ -67,10 +62,8 @@ class Baseline:
         samples, parts = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), list[Array]()
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
-            some = samples.of(rows)
-            parts.append(self.by_unit[unit].run(some.y, some.u, values))
-        estimate = np.concatenate(parts, axis=1)[:, np.argsort(np.concatenate(list(units.values())))]
-        return estimate if self.limits is None else np.clip(estimate, *self.limits)
+            parts.append(self.by_unit[unit].run(samples.y[:, rows], samples.u[:, rows], values))
+        return np.concatenate(parts, axis=1)[:, np.argsort(np.concatenate(list(units.values())))]
 
 
 def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
@@ -85,7 +78,6 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         models.A[row],
         models.B[row],
         models.measured,
-        models.recorded_inputs,
         np.stack([10**level * shape for level in DEFAULT.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
@@ -152,7 +144,7 @@ class MeanProfile:
     inputs: Sequence[Array]  # (n_samples, m)
     states: Sequence[Array]  # (n_samples, h)
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest."""
         del parameters
         estimate, sizes = np.full((*y.shape[:2], self.n_states), np.nan), largest_of(self.inputs)
@@ -164,13 +156,13 @@ class MeanProfile:
 
 def held(signal: Array, n_samples: int) -> Array:
     """Return a signal, shape (n, ...), of `n_samples` samples: cut, or held at its last one."""
-    return np.asarray(signal[np.minimum(np.arange(n_samples), len(signal) - 1)])
+    return signal[np.minimum(np.arange(n_samples), len(signal) - 1)]
 
 
 def largest_of(inputs: Sequence[Array]) -> Array:
     """Return the largest absolute value of every input over motions, one where it is always zero."""
     largest = np.max([np.abs(motion).max(axis=0) for motion in inputs], axis=0)
-    return np.asarray(np.where(largest > 0, largest, 1.0))
+    return np.where(largest > 0, largest, 1.0)
 
 
 def difference(u: Array, motion: Array, sizes: Array) -> float:
@@ -228,4 +220,4 @@ def unit_means(
         if apart[at] <= same:
             states = held(part.states[:, 0, list(estimated)], len(motions[at]))
             profiles[at].setdefault(part.units[0], []).append(states)
-    return [{unit: np.asarray(np.mean(some, axis=0)) for unit, some in one.items()} for one in profiles]
+    return [{unit: np.mean(some, axis=0) for unit, some in one.items()} for one in profiles]

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
 from ..core.rounding import TINY
@@ -22,7 +22,7 @@ from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, 
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound, linear_estimate
 from ..observer.estimator.gaps import losses
-from ..observer.residual.one_step import one_step_residual
+from ..observer.residual import one_step_residual
 from ..observer.runtime import Guard
 from ..observer.screen import Screen
 from ..observer.simulate import run_observers
@@ -35,7 +35,6 @@ from .task import Design, DesignTask
 from .validation import TRAINING, hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
     for design, (guard, certificate, bound), *percents in zip(
         designs, parts, *map(np.ndarray.tolist, errors), strict=True
     ):
-        facts = {**design.facts, **_facts(certificate, bound, design.observer.measured, percents)}
+        facts = {**design.facts, **_facts(certificate, bound, design.observer, percents)}
         observer = replace(design.observer, guard=guard)
         certified.append(replace(design, observer=observer, certificate=certificate, facts=facts))
     return certified
@@ -83,19 +82,22 @@ def certified_on(task: DesignTask) -> list[EpisodeBatch]:
         others.setdefault(key.condition, []).append(key)
     batches = []
     for training in (task.training, *(replace(task.recordings, keys=tuple(keys)) for keys in others.values())):
-        first = training.first_of_units().read().head(DEFAULT.samples)
+        firsts = {key.unit: key for key in reversed(training.keys)}
+        keys = tuple(key for key in training.keys if firsts[key.unit] == key)
+        first = replace(training, keys=keys).read().head(DEFAULT.samples)
         batches.append(first if len(first.states) > TRAINING.short else training.read())
     return batches
 
 
 def _model_parts(observers: Sequence[Observer], batches: Sequence[EpisodeBatch], task: DesignTask) -> Iterator[Parts]:
     """Yield guards, certificates and bounds of corrected models, which run side by side."""
-    guards, scales = guards_of(observers, batches), scales_of(observers, batches[0], task)
-    for observer, guard, scale in zip(observers, guards, scales, strict=True):
-        certificate = certify_model(observer, scale, task)
+    first, sizes = observers[0], task.models.output_scale[: len(observers[0].recorded)]
+    recorded = batches[0].states, batches[0].inputs, first.own(batches[0].parameters)
+    for observer, guard in zip(observers, guards_of(observers, batches), strict=True):
+        residual = one_step_residual(first.lifting, observer.A, observer.B, *recorded)
+        certificate = certify_model(observer, ReliftScales.typical(sizes, residual, task.noise), task)
         bound = signal_bound(certificate, observer, batches[0])
-        by = factors(observer, {})[0][: len(observer.recorded)]
-        yield guard, certificate.in_sizes(observer, {}), bound.in_sizes(by)
+        yield guard, certificate.in_units(observer), bound
 
 
 def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Parts:
@@ -110,17 +112,18 @@ def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Part
     scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(at)))
     recorded = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[at])
     bound = left_out_bound(observer, sizes, units, errors, design.facts["left_out_worst_percent"])
-    return observer.guard, replace(filter_certificate(observer, scales), scales=recorded), bound.in_sizes(by[:n])
+    return observer.guard, replace(filter_certificate(observer, scales), scales=recorded), bound
 
 
 def _facts(
-    certificate: ReliftCertificate, bound: SignalBound, measured: Sequence[int], errors: Sequence[float]
+    certificate: ReliftCertificate, bound: SignalBound, observer: Observer, errors: Sequence[float]
 ) -> dict[str, Any]:
     """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
     facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
     facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
-    facts |= bound.facts(measured) | {"assumptions": certificate.assumptions}
-    cover = zip(bound.states, bound.cover.tolist(), strict=True)
+    facts |= bound.facts(observer.measured) | {"assumptions": certificate.assumptions}
+    recorded = bound.cover * factors(observer, {})[0][: len(bound.states)]
+    cover = zip(bound.states, recorded.tolist(), strict=True)
     facts["set_bound"] = {state: value if np.isfinite(value) else None for state, value in cover}
     return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 
@@ -129,15 +132,7 @@ def hidden_error_percent(observers: Sequence[Observer], batches: Sequence[Episod
     """Return the mean error of hidden states over conditions, (observer,), errors times factors, (observer, n)."""
     percents = [percent_of(observers, batch) * by for batch in batches]
     logs = [np.log(hidden_mean(percent, observers[0].measured)) for percent in percents]
-    return np.asarray(np.exp(np.mean(logs, axis=0)))
-
-
-def scales_of(observers: Sequence[Observer], batch: EpisodeBatch, task: DesignTask) -> list[ReliftScales]:
-    """Return the sizes that every gain refers to: ranges, one-step residuals of the observer's model, quantisation."""
-    first, sizes = observers[0], task.models.output_scale[: len(observers[0].recorded)]
-    recorded = batch.states, batch.inputs, first.own(batch.parameters)
-    residuals = (one_step_residual(first.lifting, o.A, o.B, *recorded) for o in observers)
-    return [ReliftScales.typical(sizes, residual, task.noise) for residual in residuals]
+    return np.exp(np.mean(logs, axis=0))
 
 
 def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:

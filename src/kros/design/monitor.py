@@ -15,8 +15,8 @@ from functools import partial
 from itertools import combinations, product
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Flags
 from ..core.rounding import EPS, ITERATED, ROUNDING
 from ..core.work import Work
 from ..observer import Observer
@@ -26,9 +26,8 @@ from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
 from .validation import TrainingSet, spread
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 Group = tuple[str, str]  # unit and condition
-Judged = tuple[Array, npt.NDArray[np.bool_]]  # innovations, (n_samples, q), and which samples are judged
+Judged = tuple[Array, Flags]  # innovations, (n_samples, q), and which samples are judged
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def steady(largest: Mapping[Group, Array], settings: MonitorSettings = DEFAULT) 
     covariance = (1 - settings.shrink) * covariance + np.diag(diagonal)
     root, large = np.linalg.cholesky(covariance).T, 1e3 * float(np.sqrt(np.trace(covariance)))
     shares, _ = nnls(np.vstack([root, np.full((1, len(root)), large)]), np.append(np.zeros(len(root)), large))
-    return np.asarray((shares / shares.sum()).reshape(next(iter(largest.values())).shape))
+    return (shares / shares.sum()).reshape(next(iter(largest.values())).shape)
 
 
 def weighted(shares: Array) -> Array:

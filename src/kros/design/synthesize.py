@@ -16,8 +16,8 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.artifacts import plain
 from ..core.errors import ConfigError, SynthesisError
 from ..core.settings import require_kind
@@ -27,7 +27,7 @@ from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor
-from ..observer.sensor import Sensors, require_measured, sides
+from ..observer.sensor import Sensors, require_measured
 from ..observer.units import in_sizes
 from ..uncertainty.quantify import UncertainModels
 from .certificates import certificate, certify, usable_problem
@@ -38,7 +38,6 @@ from .task import Design, DesignTask, Method, split_name
 from .validation import TrainingSet
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -183,8 +182,7 @@ def tasks_of(
     identified, covered = uncertain.models, uncertain.sets[kind]
     require_measured(sensor or {}, identified.population.measured)
     recorded = identified.models(kind)
-    models, n = recorded.normalised(), recorded.lifting.n_states
-    lower, upper = sides(identified.facts.limits, recorded.lifting.states)
+    models = recorded.normalised()
     noise = measurement_noise(identified, recorded, sensor or {}) / recorded.output_scale[list(recorded.measured)]
     problem, refusal = usable_problem(models, covered, noise)
     task = partial(
@@ -197,7 +195,6 @@ def tasks_of(
         training=TrainingSet.of(identified, recorded, sensor).normalised(recorded),
         recordings=TrainingSet.whole(identified, recorded, sensor).normalised(recorded),
         covered=covered.unit_ids,
-        limits=(lower / recorded.output_scale[:n], upper / recorded.output_scale[:n]),
     )
     return [task(f"{kind}/{m.name}", m) for m in suitable(methods, kind, identified.kinds)]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import SynthesisError
 from ..core.lti import gain
@@ -20,8 +20,6 @@ from ..observer import Observer, ReliftCertificate, Runtime
 from ..observer.sensor import Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .validation import TrainingSet, percent_of, rank
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -126,7 +124,6 @@ class DesignTask:
     training: TrainingSet
     recordings: TrainingSet
     covered: tuple[str, ...]
-    limits: tuple[Array, Array]  # of states, (n,) each, infinite where there is none
 
     def observer(self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None) -> Observer:
         """Return the observer of a synthesis, with the nominal model or another one."""
@@ -158,9 +155,8 @@ class DesignTask:
 
     @property
     def runtime(self) -> Runtime:
-        """What observers have to know of the machine: the delay of measurements, and limits that clip estimates."""
-        limits = self.limits if np.isfinite(self.limits).any() else (None, None)
-        return Runtime(delay_of(self.sensor), *limits)
+        """What observers have to know of the machine: the delay of measurements."""
+        return Runtime(delay_of(self.sensor))
 
     @property
     def selector(self) -> Array:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.rounding import TINY
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.prepare import scale_population
-from ..evaluate.errors import error_rms
+from ..evaluate.errors import error_rms, largest
 from ..evaluate.held_out import observers_run
 from ..evaluate.sensor import as_shown
 from ..identify import ModelSet
@@ -22,7 +22,6 @@ from ..identify.identified import IdentifiedModels
 from ..observer import Observer, Seen
 from ..observer.sensor import Sensors, in_units
 
-Array = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 
@@ -74,14 +73,9 @@ class TrainingSet:
     def normalised(self, models: ModelSet) -> TrainingSet:
         """Return the same in channels divided by the ranges of models."""
         outputs, inputs = models.output_scale[list(models.measured)], models.input_scale[: len(models.recorded_inputs)]
-        seen = None if self.seen is None else self.seen.times(1 / outputs, 1 / inputs)
+        seen = None if self.seen is None else Seen(self.seen.measured / outputs, self.seen.inputs / inputs)
         population, sensor = scale_population(self.population, models.sizes), in_units(self.sensor, models.sizes)
         return replace(self, population=population, seen=seen, sensor=sensor)
-
-    def first_of_units(self) -> TrainingSet:
-        """Return the first episode of every unit."""
-        firsts = {key.unit: key for key in reversed(self.keys)}
-        return replace(self, keys=tuple(key for key in self.keys if firsts[key.unit] == key))
 
     def read(self, most: int | None = TRAINING.samples) -> EpisodeBatch:
         """Read the episodes, cut short, or whole with None."""
@@ -103,20 +97,17 @@ class TrainingSet:
 
 
 def percent_of(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
-    """Return the errors of observers of one model of every recorded state, shape (observer, n), see `compare`."""
-    run, y = observers_run(observers), batch.measurements(observers[0].measured)
-    return np.concatenate([compare(some, batch) for some in run(batch.keys, y, batch.inputs, batch.parameters)])
+    """Return mean errors of observers of one model in percent of a unit's largest value, (observer, n), else infinite.
 
-
-def compare(estimates: Iterable[Array], batch: EpisodeBatch) -> Array:
-    """Return mean errors in percent of a unit's largest value, shape (estimate, n); infinite where one diverges."""
-    x, lengths = batch.states, batch.lengths
-    inside = np.arange(len(x))[:, None, None] < lengths[:, None]
-    size = np.max(np.abs(x), axis=0, where=inside, initial=0.0)
-    groups = np.array([f"{key.unit}\n{key.condition}" for key in batch.keys])  # an episode without motion has no size
+    A unit's largest value is that of all its episodes in a condition: an episode without motion has no size.
+    """
+    x, lengths, y = batch.states, batch.lengths, batch.measurements(observers[0].measured)
+    size, groups = largest(x, lengths), np.array([f"{key.unit}\n{key.condition}" for key in batch.keys])
     size = np.array([size[groups == group].max(axis=0) for group in groups])
+    runs = observers_run(observers)(batch.keys, y, batch.inputs, batch.parameters)
     with np.errstate(divide="ignore", invalid="ignore"):
-        errors = [(100 * error_rms(e[..., : x.shape[-1]], x, lengths) / size).mean(axis=0) for e in estimates]
+        rms = (error_rms(e[..., : x.shape[-1]], x, lengths) for e in chain.from_iterable(runs))
+        errors = [(100 * error / size).mean(axis=0) for error in rms]
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
@@ -134,7 +125,7 @@ def spread(keys: Sequence[T], count: int) -> list[T]:
 def hidden_mean(values: Array, measured: Sequence[int]) -> Array:
     """Return the geometric mean of values (..., n) over the hidden states (all, where none is hidden)."""
     hidden = [i for i in range(values.shape[-1]) if i not in measured] or list(measured)
-    return np.asarray(np.exp(np.mean(np.log(np.maximum(values[..., hidden], TINY)), axis=-1)))
+    return np.exp(np.mean(np.log(np.maximum(values[..., hidden], TINY)), axis=-1))
 
 
 def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, float]:

@@ -48,7 +48,7 @@ def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: 
         spectra[rows] = np.swapaxes(error_spectrum(error[rows, :, :length], dt, axis=-1)[1], 1, 2)
     rms = np.sqrt(np.einsum("bns,bns->bn", error, error) / lengths[:, None])
     freqs_hz = np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float)
-    return ErrorSummary(rms, _percent(rms, _largest(truth, lengths)), spectra, freqs_hz)
+    return ErrorSummary(rms, _percent(rms, largest(truth, lengths)), spectra, freqs_hz)
 
 
 def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
@@ -71,11 +71,11 @@ def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64])
     >>> error_percent(recorded + 0.1, recorded, np.array([3])).round(9).tolist()
     [[2.5]]
     """
-    return _percent(error_rms(estimate, truth, lengths), _largest(truth, lengths))
+    return _percent(error_rms(estimate, truth, lengths), largest(truth, lengths))
 
 
-def _largest(truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
-    """Largest absolute values of episodes, shape (batch, n)."""
+def largest(truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+    """Return the largest absolute values of episodes, shape (batch, n)."""
     if np.all(lengths == len(truth)):
         return np.maximum(truth.max(axis=0), -truth.min(axis=0))
     return np.asarray(

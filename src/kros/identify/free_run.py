@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from ..lifting import Lifting
-from ..loops import Library, formulas, library, tape_of
+from ..loops import Library, formulas, library
 
 Array = npt.NDArray[np.float64]
 
@@ -114,5 +114,5 @@ def _compiled(
         "past": np.ascontiguousarray(window[:, n:]),
         "states": states[h:],
     }
-    loops.call("kros_relift", formulas(lifting, tape_of(lifting, m), parameters, m, batch), ("relift_job", job))
+    loops.call("kros_relift", formulas(lifting, parameters, m, batch), ("relift_job", job))
     return states.transpose(2, 0, 1)

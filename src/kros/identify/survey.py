@@ -15,15 +15,16 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arrays import Array
 from ..core.artifacts import file_digest, load_artifact, loader, united
 from ..core.errors import DataError
 from ..core.files import is_file, link_or_copy
+from ..core.rounding import ITERATED
 from ..core.work import Work
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, Array, EpisodeKey, Population, split_episodes
+from ..data.population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from ..data.prepare import recording_marks
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..data.recording import CHECK, check_population, refuse_copies, some, title, usable_episodes
-from .flat_tops import Ends, FoundLimit, ends_of, found_limit, smallest_step
 
 
 def period_alerts(period_s: float) -> tuple[str, ...]:
@@ -50,7 +51,6 @@ class RecordingFacts:
     dropped: tuple[str, ...] = ()  # episodes that were left out, with the reason
     alerts: tuple[str, ...] = ()  # what looks wrong in the recordings without making them unusable
     reserve: tuple[str, ...] = ()
-    limits: Mapping[str, FoundLimit] = field(default_factory=dict)  # of states that are not measured
     digests: Mapping[EpisodeKey, str] = field(default_factory=dict)
 
     @cached_property
@@ -108,8 +108,6 @@ class _EpisodeFacts:
     key: EpisodeKey
     digest: str
     n_samples: int
-    reach: Array  # lowest and highest inputs, shape (2, m)
-    ends: dict[str, Ends]  # of the states that are not measured
 
 
 @dataclass(frozen=True)
@@ -182,9 +180,6 @@ def _facts(
     if short := [f"{title(e.key)} has {e.n_samples}" for e in episodes if e.n_samples < options.fewest]:
         needs = f"every episode needs at least {options.fewest} samples after preparation"
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
-    pooled = [e for e in episodes if groups[e.key.unit] != OUTLIERS]
-    ranges = np.ptp(np.concatenate([e.reach for e in pooled]), axis=0) if pooled else np.zeros(0)
-    limits = {name: found_limit([e.ends[name] for e in pooled], ranges) for name in (pooled[0].ends if pooled else ())}
     return RecordingFacts(
         identify_on=condition_of(population.select(part), options.identify_on),
         groups=groups,
@@ -194,7 +189,6 @@ def _facts(
         dropped=tuple(str(k) for k in population.episodes if k not in left),
         alerts=period_alerts(retained.sample_period_s),
         reserve=tuple(options.reserve),
-        limits={name: limit for name, limit in limits.items() if limit is not None},
         digests={e.key: e.digest for e in episodes},
     )
 
@@ -223,16 +217,12 @@ def _read_group(task: _Group) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
     population, record, written = task.population, None, None
     names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
-    n, hidden = len(population.states), [s for s in population.states if s not in population.measured]
 
     def usable() -> Iterator[tuple[EpisodeKey, Array, str]]:
         for key, values, digest in usable_episodes(population, task.on_nan):
             for name in population.measured if not episodes else ():
                 resolution[name] = smallest_step(values[:, names.index(name)])
-            inputs = values[:, n : len(names)]
-            ends = {name: ends_of(key, values[:, names.index(name)], inputs) for name in hidden}
-            reach = np.stack([inputs.min(axis=0), inputs.max(axis=0)])
-            episodes.append(_EpisodeFacts(key, digest, len(values), reach, ends))
+            episodes.append(_EpisodeFacts(key, digest, len(values)))
             yield key, values, digest
 
     if task.folder is None:
@@ -241,6 +231,13 @@ def _read_group(task: _Group) -> _GroupFacts:
         record = write_group(population, task.folder, usable())
         written = file_digest(task.folder / record.file)
     return _GroupFacts(record, written, resolution, episodes)
+
+
+def smallest_step(signal: Array) -> float:
+    """Return the smallest step between samples, the quantisation of a digital sensor; rounding where there is none."""
+    steps, floor = np.abs(np.diff(signal)), ITERATED * float(np.abs(signal).max())
+    smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
+    return smallest if np.isfinite(smallest) else floor
 
 
 def _retained(population: Population, groups: Sequence[_GroupFacts], folder: Path | None) -> Population:

@@ -9,20 +9,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import signature
 from itertools import combinations_with_replacement
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationError, validate_call
 
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from .formula import MAX_DELAY, delayed_name
 
-Array = npt.NDArray[np.float64]
 Formulas = tuple[str, ...]
 T = TypeVar("T")
 MAX_FORMULAS = 100_000  # of one family
@@ -123,7 +122,12 @@ def radial(names: Names, centres: Any, length: Lengths) -> Formulas:
     if centres.shape[1] != len(names) or not len(centres):
         raise ConfigError(f"radial: centres should have the shape (n, {len(names)}), found shape {centres.shape}.")
     lengths = np.broadcast_to(lengths, (len(names),))
-    return tuple(f"exp(-({_squared_distance(names, centre, lengths)})/2)" for centre in centres)
+    texts = []
+    for centre in centres:
+        columns = zip(names, centre, lengths, strict=True)
+        parts = (f"(({wrapped(name)} - {number(c)})/{number(scale)})**2" for name, c, scale in columns)
+        texts.append(f"exp(-({' + '.join(parts)})/2)")
+    return tuple(texts)
 
 
 @checked
@@ -143,7 +147,7 @@ def kmeans_centres(data: Any, n: Count, seed: int, starts: Count = 8) -> Array:
     means, _ = kmeans(data / spread, n, iter=starts, rng=np.random.default_rng(seed))
     if len(means) < n:
         raise ConfigError(f"kmeans_centres: the data have {len(means)} clusters, not {n}; ask for fewer.")
-    return np.asarray(means * spread)
+    return means * spread
 
 
 KINDS: dict[str, Callable[..., Any]] = {
@@ -192,11 +196,6 @@ def number(value: float) -> str:
 def wrapped(formula: str) -> str:
     """Put a formula into parentheses where it is more than a name."""
     return formula if formula.isidentifier() else f"({formula})"
-
-
-def _squared_distance(names: Sequence[str], centre: Array, lengths: Array) -> str:
-    columns = zip(names, centre, lengths, strict=True)
-    return " + ".join(f"(({wrapped(name)} - {number(c)})/{number(scale)})**2" for name, c, scale in columns)
 
 
 def _finite(what: str, values: Any) -> Array:

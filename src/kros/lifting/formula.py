@@ -13,14 +13,14 @@ import ast
 import math
 import operator
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Parameters
 from ..core.errors import ConfigError
 from ..core.files import did_you_mean
 from .program import FUNCTIONS, Program
@@ -78,7 +78,7 @@ class Formula:
         """Names that the formula depends on, those of earlier values among them."""
         return frozenset(symbol.name for symbol in self.expression.free_symbols)
 
-    def evaluate(self, values: Mapping[str, npt.ArrayLike]) -> npt.NDArray[np.float64]:
+    def evaluate(self, values: Parameters) -> Array:
         """Evaluate at arrays by name that broadcast against each other."""
         arrays = {name: np.asarray(value, dtype=float) for name, value in values.items()}
         return np.asarray(Program.of([self.expression]).run(arrays)[0])

@@ -19,12 +19,11 @@ from functools import lru_cache, reduce
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from .formula import Formula, base_and_delay
 
-Array = npt.NDArray[np.float64]
 Box = Mapping[str, Any]
 Sides = dict[str, tuple[float, float]]
 PIECES = 200  # of a box: a limit of the work, the bounds hold for any number

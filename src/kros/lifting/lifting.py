@@ -18,16 +18,13 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Parameters
 from ..core.errors import ConfigError, DimensionError
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
 from .program import Program
 from .window import FormulaSeparation, Window
-
-Array = npt.NDArray[np.float64]
-Parameters = Mapping[str, npt.ArrayLike]
 
 
 @dataclass(frozen=True)
@@ -75,19 +72,6 @@ class Lifting:
     def __reduce__(self) -> tuple[Any, ...]:
         """Rebuild from the texts in a worker process: programs do not travel."""
         return Lifting, tuple(getattr(self, f.name) for f in fields(self))
-
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any]) -> Lifting:
-        """Rebuild a lifting from ``states``, ``lifting``, ``parameters`` and what `extension` gave."""
-        names = ("states", "lifting", "parameters", "lifting_inputs", "input_functions")
-        sizes = tuple((name, float(size)) for name, size in content.get("sizes", ()))
-        states, functions, parameters, inputs, input_functions = (tuple(content.get(name, ())) for name in names)
-        return cls(states, functions, parameters, inputs, input_functions, sizes)
-
-    def extension(self) -> dict[str, Any]:
-        """Return what an artifact has to hold besides states, functions and parameters; nothing for a plain lifting."""
-        extra = {"lifting_inputs": self.inputs, "input_functions": self.input_functions, "sizes": self.sizes}
-        return {name: value for name, value in extra.items() if value}
 
     def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
         """Return the lifting for channels and functions divided by sizes; formulas stay as they are written.
@@ -147,7 +131,7 @@ class Lifting:
         """Names of the lifted states."""
         return self.states + self.functions
 
-    def lift(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
+    def lift(self, x: ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the lifted states (..., n + p) of windows (..., n_window): of states alone where there are no delays.
 
         Values of parameters broadcast against ``x[..., 0]``.
@@ -155,17 +139,10 @@ class Lifting:
         x = self._windows(x)
         lifted = np.empty((*x.shape[:-1], self.n_lifted))
         lifted[..., : self.n_states] = x[..., : self.n_states]
-        self.lift_into(lifted, parameters, x[..., self.n_states :])
+        self._fill(lifted[..., self.n_states :], self._programs[0], parameters, x)
         return lifted
 
-    def lift_into(self, lifted: Array, parameters: Parameters | None = None, earlier: Array | None = None) -> None:
-        """Fill the lifted functions behind states that are already in place, shape (..., n + p).
-
-        Earlier values, shape (..., n_earlier), are needed where the lifting has delays.
-        """
-        self._programs[0].fill(lifted, self._values(parameters, lifted, earlier), self.n_states)
-
-    def lift_inputs(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
+    def lift_inputs(self, u: ArrayLike, window: ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the inputs (..., m) with the input functions behind them, (..., m + r), on windows (..., n_window)."""
         u = np.asarray(u, dtype=float)
         self.window.require_inputs(u)
@@ -173,12 +150,20 @@ class Lifting:
             return u
         window = self._windows(window)
         out = np.concatenate([u, np.empty((*u.shape[:-1], len(self.input_functions)))], axis=-1)
-        self._programs[1].fill(out, self._values(parameters, window, window[..., self.n_states :], u), u.shape[-1])
+        self._fill(out[..., u.shape[-1] :], self._programs[1], parameters, window, u)
         return out
 
     def windows(self, x: Array, u: Array) -> Array:
         """Return the windows of a recording, shape (..., n_samples - history, n_window), from sample `history` on."""
-        return self.window.slide(x, u)
+        window = self.window
+        window.require_inputs(u)
+        if not window.depths:
+            return x
+        window.require(x.shape[-2])
+        columns, names = np.concatenate([x, u], axis=-1), (*self.states, *self.inputs)
+        h, end = window.history, x.shape[-2]
+        earlier = [columns[..., h - d : end - d, names.index(q)] for q, d in window.delayed]
+        return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
 
     def parameter_values(self, parameters: Parameters | None = None) -> dict[str, Array]:
         """Return the values of all parameters, refusing to go on where one is missing."""
@@ -190,10 +175,10 @@ class Lifting:
 
     def slopes(
         self,
-        x: npt.ArrayLike,
+        x: ArrayLike,
         parameters: Parameters | None = None,
         names: tuple[str, ...] | None = None,
-        u: npt.ArrayLike | None = None,
+        u: ArrayLike | None = None,
     ) -> Array:
         """Return the derivative of the lifted functions, with inputs that of the input functions, on windows.
 
@@ -202,7 +187,7 @@ class Lifting:
         x, names, inputs = self._windows(x), names or self.window.names, None if u is None else np.asarray(u)
         formulas = self.formulas if inputs is None else self.input_formulas
         slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
-        _derivatives(formulas, names).fill(slopes, self._values(parameters, x, x[..., self.n_states :], inputs))
+        self._fill(slopes, _derivatives(formulas, names), parameters, x, inputs)
         return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
 
     def slope_bounds(self, box: Box | None = None) -> tuple[Array, Array]:
@@ -232,28 +217,17 @@ class Lifting:
         functions, gamma = ([formula.expression for formula in f] for f in (self.formulas, self.input_formulas))
         return Program.of(functions), Program.of(gamma)
 
-    @cached_property
-    def _read(self) -> frozenset[str]:
-        return frozenset(name for formula in self.formulas + self.input_formulas for name in formula.used)
-
-    def _windows(self, x: npt.ArrayLike) -> Array:
+    def _windows(self, x: ArrayLike) -> Array:
         x, names = np.asarray(x, dtype=float), self.window.names
         if x.shape[-1:] != (len(names),):
             raise DimensionError(f"Lifting: expected {len(names)} entries {names} last, found shape {x.shape}.")
         return x
 
-    def _values(
-        self, parameters: Parameters | None, x: Array, earlier: Array | None, u: Array | None = None
-    ) -> dict[str, Array]:
-        """Return arrays by name, of states those that functions read: an observer may have many more."""
-        values = self.parameter_values(parameters)
-        values |= {name: x[..., i] for i, name in enumerate(self.states) if name in self._read}
-        if earlier is None and self.window.depths:
-            raise DimensionError(f"Lifting: {self.window.earlier} are missing; pass earlier values, or lift windows.")
-        for names, columns in ((self.window.earlier, earlier), (self.inputs, u)):
-            if columns is not None:
-                values |= {name: columns[..., i] for i, name in enumerate(names)}
-        return values
+    def _fill(
+        self, out: Array, program: Program, parameters: Parameters | None, window: Array, u: Array | None = None
+    ) -> None:
+        """Write the values of a program along the last axis."""
+        program.fill(out, self.parameter_values(parameters) | self.window.columns(program.names, window, u))
 
 
 @lru_cache

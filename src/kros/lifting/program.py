@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 
-Whole = npt.NDArray[np.int32]
+Codes = npt.NDArray[np.int32]
 Tree = tuple[Any, ...]
 _NUMPY = {"Abs": "abs", "atan": "arctan"}
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "Abs", "sign", "atan")
@@ -28,9 +29,9 @@ class Program:
     """Operations of some expressions; registers hold the quantities, then the constants, then results."""
 
     names: tuple[str, ...]  # quantities
-    constants: npt.NDArray[np.float64]  # shape (constants,)
-    code: Whole  # shape (operations, 4): kind, register of the result, registers of the two operands
-    outputs: Whole  # register of every expression
+    constants: Array  # shape (constants,)
+    code: Codes  # shape (operations, 4): kind, register of the result, registers of the two operands
+    outputs: Codes  # register of every expression
     registers: int
 
     @classmethod
@@ -48,9 +49,9 @@ class Program:
             registers[into] = function(*(registers[i] for i in operands))
         return [registers[i] for i in self.outputs]
 
-    def fill(self, out: npt.NDArray[np.float64], values: Mapping[str, Any], first: int = 0) -> None:
-        """Write the values of the expressions along the last axis, from one column on."""
-        for column, value in enumerate(self.run(values), first):
+    def fill(self, out: Array, values: Mapping[str, Any]) -> None:
+        """Write the values of the expressions along the last axis."""
+        for column, value in enumerate(self.run(values)):
             out[..., column] = value
 
     @cached_property
@@ -188,37 +189,19 @@ class Precision:
 
 def c_code(expression: Any, name: Callable[[str], str], precision: Precision | None = None) -> str:
     """Return a SymPy tree as a C expression."""
-    writer = Writer(sorted(symbol.name for symbol in expression.free_symbols))
-    return _CText(writer, name, precision or Precision()).of(writer.write(tree_of(expression)))
-
-
-@dataclass(frozen=True)
-class _CText:
-    writer: Writer
-    name: Callable[[str], str]
-    precision: Precision
-
-    def of(self, value: int) -> str:
-        """Return the text of a value."""
-        kind, literal = self._kind(value), self.precision.literal
-        if kind == "symbol":
-            return self.name(self.writer.names[value])
-        if kind == "number":
-            text = literal(self.writer.constants[-1 - value])
-            return f"({text})" if text.startswith("-") else text
-        _, first, second = self.writer.operations[value - len(self.writer.names)]
+    precision = precision or Precision()
+    program, literal = Program.of([expression]), precision.literal
+    numbers = map(literal, program.constants.tolist())
+    texts = [*map(name, program.names), *(f"({text})" if text.startswith("-") else text for text in numbers)]
+    for number, _, first, second in program.code.tolist():
+        kind, x, other = _KINDS[number], texts[first], texts[second]
         if kind in _SIGNS:
-            return f"({self.of(first)} {_SIGNS[kind]} {self.of(second)})"
-        inner = self.of(first)
-        if kind == "power":
-            return f"pow{self.precision.suffix}({inner}, {literal(self.writer.constants[-1 - second])})"
-        if kind == "sign":
+            texts.append(f"({x} {_SIGNS[kind]} {other})")
+        elif kind == "power":
+            texts.append(f"pow{precision.suffix}({x}, {other})")
+        elif kind == "sign":
             zero, one = literal(0.0), literal(1.0)
-            return f"((({inner}) > {zero}) ? {one} : ((({inner}) < {zero}) ? -{one} : {zero}))"
-        return f"{_NAMES.get(kind, kind)}{self.precision.suffix}({inner})"
-
-    def _kind(self, value: int) -> str:
-        if value < 0:
-            return "number"
-        given = len(self.writer.names)
-        return "symbol" if value < given else self.writer.operations[value - given][0]
+            texts.append(f"((({x}) > {zero}) ? {one} : ((({x}) < {zero}) ? -{one} : {zero}))")
+        else:
+            texts.append(f"{_NAMES.get(kind, kind)}{precision.suffix}({x})")
+    return texts[program.outputs[0]]

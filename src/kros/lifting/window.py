@@ -10,20 +10,17 @@ combinations of parameter-free ones, ``sigma(w; q) = M(q) g(w)``, so that data a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Index, Parameters
 from ..core.errors import ConfigError, DataError, DimensionError
 from .formula import MAX_TERMS, Formula, base_and_delay, count_terms, delayed_name
 from .program import Program
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -88,17 +85,6 @@ class Window:
         padding = np.zeros((*x.shape[:-1], len(self.earlier)))
         return np.concatenate([x, padding, u], axis=-1)[..., self.present]
 
-    def slide(self, x: Array, u: Array) -> Array:
-        """Return the windows of a recording, shape (..., n_samples - history, n_window), from sample `history` on."""
-        self.require_inputs(u)
-        if not self.depths:
-            return x
-        self.require(x.shape[-2])
-        columns, names = np.concatenate([x, u], axis=-1), (*self.states, *self.inputs)
-        h, end = self.history, x.shape[-2]
-        earlier = [columns[..., h - d : end - d, names.index(q)] for q, d in self.delayed]
-        return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
-
     def require(self, n_samples: int, beyond: int = 0) -> None:
         """Refuse a recording that is shorter than the history and `beyond` samples after its first window."""
         needed = self.history + 1 + beyond
@@ -112,10 +98,15 @@ class Window:
         if self.inputs and u.shape[-1] != len(self.inputs):
             raise DimensionError(f"Lifting: expected {len(self.inputs)} inputs {self.inputs} last, found {u.shape}.")
 
-    def values(self, window: Array, u: Array | None = None) -> Mapping[str, Array]:
-        """Return the columns by name, the present inputs with them where they are given."""
-        named = {name: window[..., i] for i, name in enumerate(self.names)}
-        return named if u is None else named | {name: u[..., i] for i, name in enumerate(self.inputs)}
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
+    def columns(self, names: Iterable[str], window: Array, u: Array | None = None) -> dict[str, Array]:
+        """Return some columns by name, present inputs among them where they are given."""
+        columns = {name: window[..., self._places[name]] for name in names if name in self._places}
+        given = {} if u is None else {name: u[..., i] for i, name in enumerate(self.inputs)}
+        return columns | given
 
 
 @dataclass(frozen=True)
@@ -145,10 +136,10 @@ class FormulaSeparation:
     def evaluate(self, window: Array, u: Array | None = None) -> Array:
         """Return the parameter-free functions at windows (..., n_window), and inputs if given; (..., n_basis)."""
         out = np.moveaxis(np.empty((len(self.basis), *window.shape[:-1])), 0, -1)  # a function's values side by side
-        self._program.fill(out, self.window.values(window, u))
+        self._program.fill(out, self.window.columns(self._program.names, window, u))
         return out
 
-    def matrix(self, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+    def matrix(self, parameters: Parameters) -> Array:
         """Return M(q) for parameter values of any common shape, shape (..., p, n_basis)."""
         values = {name: np.asarray(parameters[name], dtype=float) for name in self.parameters}
         shape = np.broadcast_shapes(*(v.shape for v in values.values()))

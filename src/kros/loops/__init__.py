@@ -1,24 +1,13 @@
 """Time loops: what steps sample by sample, compiled where a C compiler is found.
 
-`loops.c` holds the loops, `library` compiles it at first use and calls it, `tape` brings the formulas of a lifting to
-it as data. There is one library for all liftings, models and observers, compiled once on a machine. Where there is
+`loops.c` holds the loops, `library` compiles it at first use and calls it with the formulas of a lifting as data. There
+is one library for all liftings, models and observers, compiled once on a machine. Where there is
 none, the callers go on in NumPy, which is also what tests compare with.
 """
 
 from __future__ import annotations
 
-from .compiler import COMPILERS, find_compiler
 from .filtering import recursion
 from .library import Library, formulas, library
-from .tape import Tape, tape_of
 
-__all__ = [
-    "COMPILERS",
-    "Library",
-    "Tape",
-    "find_compiler",
-    "formulas",
-    "library",
-    "recursion",
-    "tape_of",
-]
+__all__ = ["Library", "formulas", "library", "recursion"]

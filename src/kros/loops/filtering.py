@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from .library import library, linear_formulas
-
-Array = npt.NDArray[np.float64]
+from ..core.arrays import Array
+from .library import library
 
 
 def recursion(F: Array, driven: Array, first: Array, G: Array | None = None) -> Array:
@@ -26,7 +24,8 @@ def recursion(F: Array, driven: Array, first: Array, G: Array | None = None) -> 
             "u": driven.swapaxes(1, 2),
             "column": column,
         }
-        loops.call("kros_relift", linear_formulas(n, m), ("relift_job", job | {"states": states}))
+        linear = {"n": n, "m": m, "registers": n + m, "lifted": np.arange(n + m), "n_lifted": n, "n_inputs": m}
+        loops.call("kros_relift", ("formulas", linear), ("relift_job", job | {"states": states}))
         return states.swapaxes(1, 2)
     h, own = np.empty((n_samples, batch, n)), np.ascontiguousarray(F.T)
     driven = driven if G is None else driven @ G.T

@@ -7,17 +7,17 @@ import logging
 import os
 import re
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Parameters
 from ..core.errors import ConfigError
 from ..lifting import Lifting
+from ..lifting.program import Program
 from .compiler import load
-from .tape import Tape
 
 _log = logging.getLogger(__name__)
 _FLAGS = (
@@ -84,30 +84,46 @@ def library() -> Library | None:
 
 
 def formulas(
-    lifting: Lifting, tape: Tape, values: Mapping[str, npt.ArrayLike] | None, m: int, batch: int
+    lifting: Lifting, values: Parameters | None, m: int, batch: int, entries: tuple[int, ...] = ()
 ) -> tuple[str, dict[str, Any]]:
-    """Return what the loops need to know of a lifting with parameters of shape (batch,), and m recorded inputs."""
-    window, given = lifting.window, lifting.parameter_values(values)
+    """Return what the loops need to know of a lifting with m recorded inputs and parameters of shape (batch,)."""
+    given = lifting.parameter_values(values)
     own = np.array([np.broadcast_to(given[name], (batch,)) for name in lifting.parameters])
-    return "formulas", {
-        "n": lifting.n_states,
+    return "formulas", {**_tape(lifting, m, entries), "values": own}
+
+
+@lru_cache
+def _tape(lifting: Lifting, m: int, entries: tuple[int, ...]) -> dict[str, Any]:
+    """Return the formulas of a lifting, and their slopes by entries of the window, as one program."""
+    window, n, n_lifted = lifting.window, lifting.n_states, lifting.n_lifted
+    inputs = lifting.inputs or tuple(f"input {i}" for i in range(m))  # which no formula can read
+    formulas = [(n + i, formula) for i, formula in enumerate(lifting.formulas)]
+    of = [(n_lifted + m + i, formula) for i, formula in enumerate(lifting.input_formulas)]
+    slopes = [
+        (column, place, formula.derivative(window.names[entry]))
+        for column, formula in formulas + of
+        for place, entry in enumerate(entries)
+    ]
+    slopes = [row for row in slopes if row[2] != 0]
+    trees = [formula.expression for _, formula in formulas + of] + [tree for _, _, tree in slopes]
+    program = Program.of(trees, (*window.names, *inputs, *lifting.parameters))
+    functions, gamma, moved = np.split(program.outputs, np.cumsum([len(formulas), len(of)]))
+    places = np.array([(column, place) for column, place, _ in slopes]).reshape(-1, 2)
+    return {
+        "n": n,
         "earlier": len(window.earlier),
         "m": m,
-        "parameters": len(own),
-        "registers": tape.registers,
-        "constants": len(tape.constants),
-        "operations": len(tape.code),
-        "constant": tape.constants,
-        "code": tape.code,
-        "lifted": tape.lifted,
-        "n_lifted": lifting.n_lifted,
-        "n_inputs": len(tape.lifted) - lifting.n_lifted,
+        "parameters": len(lifting.parameters),
+        "registers": program.registers,
+        "constants": len(program.constants),
+        "operations": len(program.code),
+        "slopes": len(slopes),
+        "constant": program.constants,
+        "code": program.code,
+        "lifted": np.concatenate([np.arange(n), functions, np.arange(m) + len(window.names), gamma]),
+        "n_lifted": n_lifted,
+        "n_inputs": m + len(gamma),
         "shift": window.shift,
         "present": window.present,
-        "values": own,
+        "slope": np.column_stack([places, moved]),
     }
-
-
-def linear_formulas(n: int, m: int) -> tuple[str, dict[str, Any]]:
-    """Return what the loops need to know of a model of n states and m inputs without lifted functions."""
-    return "formulas", {"n": n, "m": m, "registers": n + m, "lifted": np.arange(n + m), "n_lifted": n, "n_inputs": m}

@@ -22,6 +22,7 @@ typedef struct {
     whole registers;
     whole constants;
     whole operations;
+    whole slopes;
     const double *constant;   /* (constants) */
     const int32_t *code;      /* (operations, 4): what, into, from, from */
     const int32_t *lifted;    /* registers of [x; sigma] and of [u; gamma], in the order of a model's columns */
@@ -29,6 +30,7 @@ typedef struct {
     whole n_inputs;
     const int32_t *shift;     /* (earlier): register that every earlier value has at the next sample */
     const int32_t *present;   /* (earlier): register of the quantity itself */
+    const int32_t *slope;     /* (slopes, 3): column of a model, place among the entries asked for, register; none */
     const double *values;     /* (parameters, batch) */
 } formulas;
 
@@ -40,27 +42,18 @@ typedef struct {
     whole order;       /* of the correction */
     whole q;
     whole own;         /* every machine has a map of its own: one observer, map (batch, rows, columns) */
-    whole late;        /* measurements are so many samples old, and so are the inputs of their time */
+    whole fresh;       /* earlier values equal the present ones at the first sample */
     whole overwrite;   /* measurements take the place of estimates before these are lifted */
-    whole begins;
     const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
     const double *y;          /* (samples, q, batch); none where nothing is measured */
     const double *u;          /* (samples, m, batch) */
     const int32_t *measured;  /* (q) */
-    const uint8_t *moving;    /* (samples, batch); all where there is none */
-    const int32_t *begin;     /* (samples, batch): one more than the row of `begun` that a machine starts from; none */
-    const double *begun;      /* (observers, begins, n) */
-    const int32_t *pending;   /* (samples, batch): samples between a state and its row; with `before` alone */
-    const double *low;        /* (observers, n + order): bounds beyond which a machine waits for a start; none */
+    const double *low;        /* (observers, n + order): bounds; none */
     const double *high;
-    uint8_t *waiting;         /* (observers, batch), moved on */
-    uint8_t *restart;         /* (observers, batch): whether a machine ever waited */
+    uint8_t *left;            /* (observers): whether a machine would leave the bounds; its numbers are then of no use */
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
     double *past;             /* (observers, batch, earlier), moved on */
-    uint8_t *fresh;           /* (batch): earlier values equal the present ones, moved on */
     double *states;           /* (samples, observers, n, batch): x before every sample; none */
-    double *innovation;       /* (samples, batch, q) of the first observer; none */
-    double *before;           /* (samples, batch, earlier) of the first observer, before every sample; none */
 } relift_job;
 
 /* Free runs with sensitivities: see kros.identify.refine.sensitivity for the symbols. */
@@ -74,12 +67,10 @@ typedef struct {
     whole stride;
     whole terms;       /* n, and earlier values of states that move with the model */
     whole depth;       /* sensitivities that are kept: of now, and of so many samples before */
-    whole slopes;
     whole rows;        /* of J that are written for one state and machine */
     const double *W;          /* (n, p, batch) */
     const double *T;          /* (p, p) */
     const int32_t *term;      /* (terms, 2): state, samples ago */
-    const int32_t *slope;     /* (slopes, 3): column of W, term, register */
     const double *x;          /* (samples, n, batch) */
     const double *u;          /* (samples, m, batch) */
     const uint8_t *valid;     /* (samples, batch) */
@@ -208,38 +199,26 @@ static void shifted(const formulas *f, const vec *reg, vec *next)
 PRODUCT(product, double, 1)
 PRODUCT(product_each, vec, MOST)
 
-/* Which machines go on: none that stands still or waits, and none that would leave the bounds; how many. */
-static whole guarded(const relift_job *s, whole o, whole n, const vec *next, whole first, whole lanes, const uint8_t *moving, uint8_t *waiting, uint8_t *going)
+/* Whether the next states and corrections of all machines are within the bounds. */
+static int within(const relift_job *s, whole o, whole rows, const vec *next, whole lanes)
 {
-    const whole rows = n + s->order;
-    uint8_t within[WIDE * MOST];
-    whole count = 0;
-    memset(within, 1, sizeof within);
+    int inside = 1;
     for (whole i = 0; s->low && i < rows; i++) {
         const double low = s->low[o * rows + i], high = s->high[o * rows + i];
-        for (whole b = 0; b < lanes; b++) {
-            const double x = LANES(next + i * MOST)[b];
-            within[b] &= (uint8_t)(x >= low) & (uint8_t)(x <= high);
-        }
+        for (whole b = 0; b < lanes; b++) inside &= LANES(next + i * MOST)[b] >= low && LANES(next + i * MOST)[b] <= high;
     }
-    for (whole b = 0; b < lanes; b++) {
-        const uint8_t on = (uint8_t)(!(moving && !moving[b]) && !waiting[b]);
-        going[b] = on & within[b];
-        if (on && !within[b]) waiting[b] = 1, s->restart[o * s->batch + first + b] = 1;
-        count += going[b];
-    }
-    return count;
+    return inside;
 }
 
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
     const whole columns = f->n_lifted + order + f->n_inputs + q;
-    vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *nu = vectors(q), *next = vectors(rows), *older = vectors(ne);
+    vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;
     double *map = room(rows * columns * (whole)sizeof(double));
     const vec **column = room(columns * (whole)sizeof(vec *));
-    int failed = !reg || !c || !y || !nu || !next || !older || !map || !column || (s->own && !each);
+    int failed = !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
     for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
         const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
         settle(f, reg, first, batch, lanes);
@@ -247,10 +226,7 @@ int kros_relift(const formulas *f, const relift_job *s)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
         for (whole o = 0; o < s->observers; o++) {
             double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;
-            uint8_t fresh[WIDE * MOST] = {0}, waiting[WIDE * MOST] = {0}, on[WIDE * MOST];
             whole used = 0;
-            if (s->fresh) memcpy(fresh, s->fresh + first, (size_t)lanes);
-            if (s->waiting) memcpy(waiting, s->waiting + o * batch + first, (size_t)lanes);
             for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
             for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
             for (whole e = 0; e < ne; e++) gather(reg + (n + e) * MOST, past + e, ne, lanes);
@@ -269,69 +245,37 @@ int kros_relift(const formulas *f, const relift_job *s)
             }
             for (whole i = 1; i < rows && used < columns && !s->own; i++) memmove(map + i * used, map + i * columns, (size_t)used * sizeof(double));
             for (whole k = 0; k < s->samples; k++) {
-                const whole at = k * batch + first, then = k < s->late ? 0 : k - s->late;
-                const uint8_t *moving = s->moving ? s->moving + at : NULL;
-                const int32_t *begin = s->begin ? s->begin + at : NULL;
                 if (s->states)
                     for (whole i = 0; i < n; i++) scatter(s->states + ((k * s->observers + o) * n + i) * batch + first, reg + i * MOST, 1, lanes);
-                if (s->before && o == 0)
-                    for (whole b = 0; b < lanes; b++)
-                        for (whole e = 0; e < ne; e++) {
-                            const whole from = f->present[e], of = k - s->pending[at + b];
-                            const double held = from < n ? LANES(reg + from * MOST)[b] : s->u[(of * m + from - n - ne) * batch + first + b];
-                            s->before[(at + b) * ne + e] = fresh[b] ? held : LANES(reg + (n + e) * MOST)[b];
-                        }
-                for (whole b = 0; begin && b < lanes; b++)
-                    if (begin[b]) {
-                        for (whole i = 0; i < n; i++) LANES(reg + i * MOST)[b] = s->begun[(o * s->begins + begin[b] - 1) * n + i];
-                        for (whole i = 0; i < order; i++) LANES(c + i * MOST)[b] = 0.0;
-                        fresh[b] = 1, waiting[b] = 0;
-                    }
-                whole going = moving ? 0 : lanes;
-                for (whole b = 0; moving && b < lanes; b++) going += moving[b];
                 for (whole j = 0; j < q; j++) { /* what is predicted stands for what is missing */
                     const vec *x = reg + s->measured[j] * MOST;
-                    if (s->y) gather(y + j * MOST, s->y + (k * q + j) * batch + first, 1, lanes);
+                    gather(y + j * MOST, s->y + (k * q + j) * batch + first, 1, lanes);
                     for (whole v = 0; v < w; v++) {
                         const vec seen = y[j * MOST + v];
-                        y[j * MOST + v] = s->y ? either(seen - seen == 0.0, seen, x[v]) : x[v];
-                        nu[j * MOST + v] = y[j * MOST + v] - x[v];
+                        y[j * MOST + v] = either(seen - seen == 0.0, seen, x[v]);
                     }
-                    if (s->innovation && o == 0) scatter(s->innovation + at * q + j, nu + j * MOST, q, lanes);
                 }
-                if (!going) continue;
                 for (whole j = 0; j < q && s->overwrite; j++) memcpy(reg + s->measured[j] * MOST, y + j * MOST, MOST * sizeof(vec));
-                for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (then * m + j) * batch + first, 1, lanes);
-                for (whole e = 0; e < ne; e++)
-                    for (whole b = 0; b < lanes; b++)
-                        if (fresh[b]) LANES(reg + (n + e) * MOST)[b] = LANES(reg + f->present[e] * MOST)[b];
+                for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
+                for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
                 evaluate(f, reg, lanes);
                 if (s->own) product_each(each, columns, column, next, rows, w);
                 else product(map, used, column, next, rows, w);
                 shifted(f, reg, older);
-                if (guarded(s, o, n, next, first, lanes, moving, waiting, on) == lanes) {
-                    memcpy(reg, next, (size_t)n * MOST * sizeof(vec));
-                    memcpy(c, next + n * MOST, (size_t)order * MOST * sizeof(vec));
-                    memcpy(reg + n * MOST, older, (size_t)ne * MOST * sizeof(vec));
-                    memset(fresh, 0, sizeof fresh);
-                    continue;
+                if (!within(s, o, rows, next, lanes)) {
+                    s->left[o] = 1;
+                    break;
                 }
-                for (whole b = 0; b < lanes; b++)
-                    if (on[b]) {
-                        for (whole i = 0; i < n; i++) LANES(reg + i * MOST)[b] = LANES(next + i * MOST)[b];
-                        for (whole i = 0; i < order; i++) LANES(c + i * MOST)[b] = LANES(next + (n + i) * MOST)[b];
-                        for (whole e = 0; e < ne; e++) LANES(reg + (n + e) * MOST)[b] = LANES(older + e * MOST)[b];
-                        fresh[b] = 0;
-                    }
+                memcpy(reg, next, (size_t)n * MOST * sizeof(vec));
+                memcpy(c, next + n * MOST, (size_t)order * MOST * sizeof(vec));
+                memcpy(reg + n * MOST, older, (size_t)ne * MOST * sizeof(vec));
             }
             for (whole i = 0; i < n; i++) scatter(state + i * batch, reg + i * MOST, 1, lanes);
             for (whole i = 0; i < order; i++) scatter(state + (f->n_lifted + i) * batch, c + i * MOST, 1, lanes);
             for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
-            if (s->waiting) memcpy(s->waiting + o * batch + first, waiting, (size_t)lanes);
-            if (o == s->observers - 1 && s->fresh) memcpy(s->fresh + first, fresh, (size_t)lanes);
         }
     }
-    free(reg), free(c), free(y), free(nu), free(next), free(older), free(each), free(map), free(column);
+    free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column);
     return failed;
 }
 
@@ -355,8 +299,8 @@ int kros_sensitivities(const formulas *f, const sensitivity_job *s)
             for (whole a = 0; a < n; a++)
                 for (whole t = 0; t < terms; t++)
                     for (whole v = 0; v < w; v++) F[(a * terms + t) * MOST + v] = t < n ? W[(a * p + t) * MOST + v] : (vec){0};
-            for (whole i = 0; i < s->slopes; i++) {
-                const int32_t *of = s->slope + 3 * i;
+            for (whole i = 0; i < f->slopes; i++) {
+                const int32_t *of = f->slope + 3 * i;
                 for (whole a = 0; a < n; a++)
                     for (whole v = 0; v < w; v++) F[(a * terms + of[1]) * MOST + v] += W[(a * p + of[0]) * MOST + v] * reg[of[2] * MOST + v];
             }

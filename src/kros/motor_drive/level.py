@@ -19,11 +19,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import DimensionError
-
-Array = npt.NDArray[np.float64]
 
 
 class LoadAndCurrent(NamedTuple):
@@ -53,7 +51,7 @@ class AngleLoad:
     limit: float = np.inf  # of the current
     trusted: float = 0.5  # most that a load at the limit differs from what the angle says, as a share of the limit
 
-    def run(self, seen: npt.ArrayLike, current: npt.ArrayLike, position: npt.ArrayLike) -> LoadAndCurrent:
+    def run(self, seen: ArrayLike, current: ArrayLike, position: ArrayLike) -> LoadAndCurrent:
         """Return loads and currents with their levels, for signals of shape (n_samples, batch).
 
         `seen` and `current` are the observer's load and current in the current's unit, `position` is measured in rad;
@@ -65,7 +63,7 @@ class AngleLoad:
                 f"Level of a load: seen part {seen.shape}, current {current.shape} and position {position.shape} "
                 f"should all be (n_samples, batch)."
             )
-        running = self.start(position[0])
+        running = _RunningAngleLoad(self, position[0])
         rows = [running.step(*sample) for sample in zip(seen, current, position, strict=True)]
         return LoadAndCurrent(*(np.stack(column) for column in zip(*rows, strict=True)))
 
@@ -74,12 +72,8 @@ class AngleLoad:
         """What of a level is left after a sample."""
         return float(np.exp(-self.sample_period_s / self.level_s))
 
-    def start(self, position: npt.ArrayLike) -> RunningAngleLoad:
-        """Return the same sample by sample, for machines that start at angles in rad, shape (batch,)."""
-        return RunningAngleLoad(self, np.atleast_1d(np.asarray(position, dtype=float)))
 
-
-class RunningAngleLoad:
+class _RunningAngleLoad:
     """`AngleLoad` sample by sample, for some machines at once."""
 
     def __init__(self, settings: AngleLoad, position: Array) -> None:
@@ -96,7 +90,7 @@ class RunningAngleLoad:
         phi = np.where(np.isnan(phi), self._phi, phi)
         self._psi = psi = pole * self._psi + np.nan_to_num(phi - self._phi)
         self._phi, self._excess, self._need = phi, pole * self._excess, pole * self._need
-        coefficients = self._coefficients()
+        coefficients = np.linalg.solve(self._gram.transpose(2, 0, 1), self._right.T[..., None])[..., 0].T
         of_angle = np.sum(np.nan_to_num(phi) * coefficients, axis=0)  # zero where no angle has arrived yet
         load = seen - self._excess + of_angle - np.sum(psi * coefficients, axis=0)
         total = current - seen - self._need + load
@@ -116,7 +110,3 @@ class RunningAngleLoad:
         self._gram = self._gram + learns * psi[:, None] * psi
         self._right += learns * psi * (seen - self._excess)
         return LoadAndCurrent(load, bounded)
-
-    def _coefficients(self) -> Array:
-        """Solve the normal equations of c, two by two."""
-        return np.linalg.solve(self._gram.transpose(2, 0, 1), self._right.T[..., None])[..., 0].T

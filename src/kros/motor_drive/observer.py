@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Flags
 from ..core.errors import DataError, DimensionError
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
@@ -24,7 +24,6 @@ from ..lifting import Lifting
 from ..observer import EstimatorSettings, Observer, Recordings, identify_estimator
 from .signals import low_passed, without_level
 
-Array = npt.NDArray[np.float64]
 LOAD = "load"
 
 
@@ -77,7 +76,7 @@ def load_observer(
     return result.observer, tuple(np.flatnonzero(at_limit).tolist())
 
 
-def _at_limit(batch: EpisodeBatch, settings: LoadSettings) -> npt.NDArray[np.bool_]:
+def _at_limit(batch: EpisodeBatch, settings: LoadSettings) -> Flags:
     """Episodes in which the current reaches its limit, where the controller does not do what its errors say."""
     if settings.current is None:
         return np.zeros(len(batch.keys), bool)

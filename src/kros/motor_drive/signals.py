@@ -17,14 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import ConfigError, DataError
 
-Array = npt.NDArray[np.float64]
 
-
-def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) -> Array:
+def low_passed(signal: ArrayLike, corner_hz: float, sample_period_s: float) -> Array:
     """Return signals below a corner without delay: Butterworth of order four, forward and backward."""
     from scipy.signal import butter, sosfiltfilt
 
@@ -35,7 +33,7 @@ def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) 
     return sosfiltfilt(sections, np.asarray(signal, dtype=float), axis=0)
 
 
-def without_level(signal: npt.ArrayLike, level_s: float, sample_period_s: float) -> Array:
+def without_level(signal: ArrayLike, level_s: float, sample_period_s: float) -> Array:
     """Return the part of signals that can be seen: their change since the start, forgotten after `level_s`."""
     from scipy.signal import lfilter
 
@@ -44,7 +42,7 @@ def without_level(signal: npt.ArrayLike, level_s: float, sample_period_s: float)
 
 
 def known_load(
-    position: npt.ArrayLike,
+    position: ArrayLike,
     sample_period_s: float,
     moment: float,
     inertia: float = 0.0,
@@ -80,7 +78,7 @@ class LoadAccuracy:
 
 
 def load_accuracy(
-    estimate: npt.ArrayLike, load: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 0
+    estimate: ArrayLike, load: ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 0
 ) -> LoadAccuracy:
     """Judge estimates of the load, shape (n_samples, batch), against known ones."""
     truth = np.asarray(load, dtype=float)
@@ -103,7 +101,7 @@ class TorqueScale:
 
     @classmethod
     def calibrated(
-        cls, error: npt.ArrayLike, known: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 300
+        cls, error: ArrayLike, known: ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 300
     ) -> TorqueScale:
         """Return the scale from the error of a current and a known load by least squares of low-passed signals."""
         x, t = (low_passed(s, corner_hz, sample_period_s)[skip:].ravel() for s in (error, known))
@@ -114,6 +112,6 @@ class TorqueScale:
         constant = float(covariance[0, 1] / covariance[0, 0])
         return cls(constant, float(x.mean() - t.mean() / constant))
 
-    def load(self, error: npt.ArrayLike) -> Array:
+    def load(self, error: ArrayLike) -> Array:
         """Return the load's torque, ``K (i - i_hat - bias)``, from measured minus estimated current."""
         return self.torque_constant * (np.asarray(error, dtype=float) - self.bias)

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Parameters
 from ..core.errors import ConfigError, DimensionError
 from ..core.linalg import balanced_size
 from ..core.lti import StateSpace
@@ -33,8 +33,6 @@ from .filter_bank import FilterBank
 from .monitor import Monitor
 from .runtime import Guard, Runtime, Seen
 from .sensor import Sensors, require_measured
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +115,7 @@ class ObserverData:
         for key, limit in self.runtime.limits().items():
             self._require(f"runtime.{key}", limit.shape, (n,))
         if self.seen is not None:
-            self._require("sizes seen in training", (len(self.seen.measured), len(self.seen.inputs)), (q, m))
+            self._require("sizes seen in training", (self.seen.measured.shape, self.seen.inputs.shape), ((q,), (m,)))
         if self.monitor is not None:
             self._require("the monitor", self.monitor.size.shape, (q,))
         require_measured(self.sensor, self.outputs)
@@ -135,8 +133,8 @@ class ObserverData:
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
                 )
         if self.guard is not None:
-            sizes = [len(bound) for bound in (self.guard.lower, self.guard.upper, self.guard.correction)]
-            self._require("the guard of states and correction", tuple(sizes), (n, n, K.n_states))
+            sizes = self.guard.lower.shape, self.guard.upper.shape, self.guard.correction.shape
+            self._require("the guard of states and correction", sizes, ((n,), (n,), (K.n_states,)))
 
     def _require(self, what: str, shape: tuple[Any, ...], wanted: tuple[Any, ...]) -> None:
         if shape != wanted:
@@ -189,9 +187,7 @@ class ObserverData:
         """States that recordings hold: all but the internal ones."""
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
-    def initial(
-        self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None
-    ) -> Array:
+    def initial(self, y: ArrayLike, parameters: Parameters | None = None, u: ArrayLike | None = None) -> Array:
         """Return the first estimate, (..., n): measurements, and others zero or as a bank starts."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
@@ -201,16 +197,14 @@ class ObserverData:
             inputs = np.broadcast_to(0.0 if u is None else u, (*y.shape[:-1], len(self.inputs)))
             values = self.values(parameters)
             lifted = [self.lifting.lift(x, values), self.lifting.lift_inputs(inputs, x, values)]
-            x = np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
+            x = np.concatenate(lifted, axis=-1) @ self.bank.start.T
         return x
 
-    def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
+    def own(self, parameters: Parameters) -> dict[str, ArrayLike]:
         """Return those parameters of many that the lifting has."""
         return {name: parameters[name] for name in self.lifting.parameters if name in parameters}
 
-    def values(
-        self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None
-    ) -> dict[str, Any]:
+    def values(self, parameters: Parameters | None = None, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
         """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`."""
         known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
         given = {name: np.asarray(values[name], dtype=float) for name in known if values.get(name) is not None}

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import ConfigDict, Field, create_model
 
+from ..core.arrays import Array
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
 from ..core.errors import DataError, KrosError
 from ..core.files import shortened
@@ -29,9 +29,9 @@ from .monitor import Monitor
 from .runtime import Guard, Runtime, Seen
 from .sensor import Sensor
 
-Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
 SCHEMA, KIND = 3, "observer"
+_PERHAPS = ("lifting_inputs", "input_functions", "sizes", "sensor", "about")  # absent where they are empty
 Name = Annotated[str, Field(min_length=1)]
 Row = list[float]
 Matrix = list[Row]
@@ -69,7 +69,13 @@ def _part(kind: Any) -> Any:
     return create_model(f"_{kind.__name__}", __base__=_Part, **held)
 
 
-_PARTS: dict[str, Any] = {"seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
+_PARTS: dict[str, Any] = {
+    "runtime": Runtime,
+    "seen": Seen,
+    "filter_bank": FilterBank,
+    "guard": Guard,
+    "monitor": Monitor,
+}
 
 
 def _field(key: str) -> str:
@@ -95,7 +101,7 @@ class _File(_Part):
     about: dict[str, Any] = Field(default_factory=dict)
 
 
-_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in {**_PARTS, "runtime": Runtime}.items()}
+_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
 _Whole = create_model("_Whole", __base__=_File, **_KINDS)
 
 
@@ -109,7 +115,9 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "name": observer.name,
         "states": lifting.states,
         "lifting": lifting.functions,
-        **lifting.extension(),
+        "lifting_inputs": lifting.inputs,
+        "input_functions": lifting.input_functions,
+        "sizes": lifting.sizes,
         "parameters": {k: observer.parameters.get(k) for k in lifting.parameters},
         "inputs": observer.inputs,
         "measured": observer.measured,
@@ -117,13 +125,12 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "sample_period_s": observer.sample_period_s,
         "model": {"A": observer.A, "B": observer.B},
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
-        "runtime": {"delay": observer.runtime.delay, **observer.runtime.limits()},
-        **{key: vars(part) for key, part in parts.items() if part is not None},
+        **{key: _given(vars(part)) for key, part in parts.items() if part is not None},
         "sensor": {name: sensor.model_dump() for name, sensor in observer.sensor.items()},
         "about": observer.about,
     }
     written: dict[str, Any] = plain(content)
-    return {key: value for key, value in written.items() if value or key not in ("sensor", "about")}
+    return {key: value for key, value in written.items() if value or key not in _PERHAPS}
 
 
 def write_observer(observer: ObserverData, path: Path) -> None:
@@ -162,7 +169,10 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         raise DataError(
             f"the names of states, inputs and parameters should differ, found {', '.join(twice)} more than once."
         )
-    lifting, measured = Lifting.from_content(content), tuple(content["measured"])
+    keys = ("states", "lifting", "parameters", "lifting_inputs", "input_functions")
+    states, functions, parameters, inputs, gamma = (tuple(content[key]) for key in keys)
+    sizes = tuple((name, float(size)) for name, size in content["sizes"])
+    lifting, measured = Lifting(states, functions, parameters, inputs, gamma, sizes), tuple(content["measured"])
     if len(set(measured)) < len(measured) or not set(measured) <= set(range(lifting.n_states)):
         raise DataError(
             f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {list(measured)}."
@@ -171,8 +181,10 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
     order, width = len(content["controller"]["A"]), m if content["injection"] == Injection.INPUT.value else n
     shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
     A, B, C, D = (_matrix(content["controller"][key], shape, f"controller.{key}") for key, shape in shapes.items())
-    given = {key: content[key] for key in _PARTS if content[key] is not None}
-    parts = {_field(k): _PARTS[k](**{f: v for f, v in part.items() if v is not None}) for k, part in given.items()}
+    given = {key: _given(part) for key, part in _given({key: content[key] for key in _PARTS}).items()}
+    for name, end in (("lower", -np.inf), ("upper", np.inf)):
+        if name in (runtime := given.get("runtime", {})):
+            runtime[name] = [end if limit is None else limit for limit in runtime[name]]
     return ObserverData(
         content["name"],
         lifting,
@@ -184,11 +196,15 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         content["injection"],
         content["sample_period_s"],
         {name: value for name, value in content["parameters"].items() if value is not None},
-        Runtime.from_content(content["runtime"] or {}),
         sensor={name: Sensor.of(value, f"sensor.{name}") for name, value in content["sensor"].items()},
         about=content["about"],
-        **parts,
+        **{_field(key): _PARTS[key](**part) for key, part in given.items()},
     )
+
+
+def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields that are not null."""
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def _matrix(rows: Matrix, shape: tuple[int, int], where: str) -> Array:

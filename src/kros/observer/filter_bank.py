@@ -23,19 +23,16 @@ by a straight line: the response r of the filters to a unit ramp was run along, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..core.errors import DataError
-from ..core.linalg import floats
+from ..core.arrays import Array, Flags
 from ..core.rounding import ITERATED
+from .checked import floats
 
-Array = npt.NDArray[np.float64]
 _FORGOTTEN = ITERATED  # samples: an age whose square counts as nothing beside any half
-_ARRAYS = ("start", "forget", "half", "recovery", "reach")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,25 +47,14 @@ class FilterBank:
     reach: Array
 
     def __post_init__(self) -> None:
-        floats(self, *_ARRAYS)
-        starts = np.isfinite(self.start).all() and np.isfinite(self.reach).all() and (self.reach >= 0).all()
-        if not (starts and np.isfinite(self.half).all() and (self.half > 0).all()):
-            raise DataError(
-                "Filter bank: start, reach and half should be finite, reach not negative and half positive."
-            )
-        if not all(((v >= 0) & (v <= 1)).all() for v in (self.forget, self.recovery)):
-            raise DataError(
-                f"Filter bank: forget {self.forget} and recovery {self.recovery} should be between 0 and 1."
-            )
+        shares = dict.fromkeys(("forget", "recovery"), "shares between 0 and 1")
+        kinds = {"start": "finite numbers", "half": "positive and finite", "reach": "finite and not negative"}
+        floats(self, "Filter bank", **kinds, **shares)
 
     def level(self, age: Array) -> Array:
         """Return m of every recorded state at ages, shape (..., n)."""
         ratio = age / self.half
         return ratio * ratio / (1 + ratio * ratio)
-
-    def times(self, columns: Array, y: Array) -> FilterBank:
-        """Return the bank in other units of measure, by factors of the columns of `start` and of measurements."""
-        return replace(self, start=self.start / columns, reach=self.reach * y)
 
 
 def longest_age(half: Array) -> Array:
@@ -95,7 +81,7 @@ class Gaps:
         for values in (self.offset, self.age, self.ramp, self.count):
             values[rows] = 0.0
 
-    def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> None:
+    def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
         if not missing.any() and not self.count.any():
             x[:, self.measured] = y
@@ -117,12 +103,12 @@ class Gaps:
         fallback, share = x[:, self.fallback], self.hidden * self.bank.level(self.age)
         return self.bank.forget * (last - fallback + share * (self.offset - last + fallback))
 
-    def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
+    def follow(self, x: Array, following: Array, missing: Flags) -> None:
         """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""
         bank, some = self.bank, np.asarray(missing.any(axis=1))
         offset = self.apart(x, np.where(missing, self.held, x[:, self.measured]))
         if not some.any() and not (self.age > _FORGOTTEN).any():
-            self.offset[moving], self.age[moving], self.count[moving] = offset[moving], 0.0, 0.0
+            self.offset, self.age[...], self.count[...] = offset, 0.0, 0.0
             return
         count = np.where(missing, self.count + 1, 0.0)
         recovered = np.where(some[:, None], self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
@@ -132,5 +118,5 @@ class Gaps:
         following[:, : self.recorded] += share * (fallback - following[:, : self.recorded])
         if some.any() or self.count.any():
             ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
-            self.ramp[moving] = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)[moving]
-        self.offset[moving], self.age[moving], self.count[moving] = offset[moving], age[moving], count[moving]
+            self.ramp = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)
+        self.offset, self.age, self.count = offset, age, count

@@ -19,17 +19,15 @@ its start: while they go by, all that the monitor remembers is held.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, Array, Flags
 from ..core.errors import DataError
-from ..core.linalg import floats
+from .checked import floats
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 LARGEST = 1e3  # sizes of the innovation that count at most
 RECOVERY = 4  # samples that are not judged after one that is not good
 WEIGHT = 16  # of all bands together
@@ -51,41 +49,30 @@ class Monitor:
     first: float = 0.0  # share that the first sample replaces, later ones less, down to `forget`
 
     def __post_init__(self) -> None:
-        arrays = ("filters", "size", "limits", "weights")
-        floats(self, *arrays)
+        arrays = {"filters": "finite numbers", "size": "positive and finite", "limits": "positive and finite"}
+        arrays |= {"weights": "finite and not negative"}
+        floats(self, "Monitor of an observer", **arrays)
         shapes, (bands, q) = [getattr(self, name).shape for name in arrays], (len(self.filters), self.size.size)
         if not bands or shapes != [(bands, 3), (q,), (q, bands), (q, bands)]:
             raise DataError(
                 f"Monitor of an observer: {', '.join(arrays)} should have shapes (bands, 3), (q), (q, bands) and "
                 f"(q, bands), found {shapes}."
             )
-        finite = all(np.isfinite(getattr(self, name)).all() for name in arrays)
-        sized = np.all(self.size > 0) and np.all(self.limits > 0) and np.all(self.weights >= 0)
         whole = np.all(self.weights == np.round(self.weights)) and self.weights.sum() == WEIGHT
-        if not (finite and sized and whole and 0 < self.forget <= 1 and 0 <= self.first <= 1 and self.settle >= 0):
+        if not (whole and 0 < self.forget <= 1 and 0 <= self.first <= 1 and self.settle >= 0):
             raise DataError(
-                "Monitor of an observer: numbers should be finite, size and limits positive, weights whole and of sum "
-                f"{WEIGHT}, forget and first within 0 and 1, settle at least 0; found {self}."
+                f"Monitor of an observer: weights should be whole and of sum {WEIGHT}, forget and first within 0 and "
+                f"1, settle at least 0; found {self}."
             )
 
-    def times(self, y: Array) -> Self:
-        """Return the monitor for measurements in other units, multiplied by `y`, shape (q,)."""
-        return replace(self, size=self.size * y)
-
     def mean_squares(self, innovation: Array, judged: Flags) -> Array:
-        """Return mean squares, (n_samples, batch, q, bands), after every sample; those not judged hold what was."""
+        """Return mean squares of a machine, (n_samples, q, bands), after every sample; those not judged change none."""
         from scipy.signal import lfilter
 
-        scaled = self.scaled(innovation)
-        squares = np.zeros((*innovation.shape, len(self.filters)))
-        for machine in range(innovation.shape[1]):
-            rows = np.flatnonzero(judged[:, machine])
-            if len(rows):
-                bands = [lfilter([b, 0, -b], [1, a1, a2], scaled[rows, machine], axis=0) for b, a1, a2 in self.filters]
-                means = self._remembered(np.stack(bands, axis=-1) ** 2)
-                latest = np.searchsorted(rows, np.arange(len(judged)), side="right")
-                squares[:, machine] = np.concatenate([np.zeros((1, *means.shape[1:])), means])[latest]
-        return squares
+        scaled = self.scaled(innovation[judged])
+        bands = [lfilter([b, 0, -b], [1, a1, a2], scaled, axis=0) for b, a1, a2 in self.filters]
+        means = self._remembered(np.stack(bands, axis=-1) ** 2)
+        return np.concatenate([np.zeros((1, *self.limits.shape)), means])[np.cumsum(judged)]
 
     def scaled(self, innovation: Array) -> Array:
         """Return innovations (..., q) over their sizes, within what counts at most."""
@@ -94,8 +81,8 @@ class Monitor:
 
     def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
         """Return the mean squares of episodes, (n_samples, q, bands), that a machine has one after the other."""
-        innovation, judged = (np.concatenate(parts)[:, None] for parts in zip(*episodes, strict=True))
-        return np.split(self.mean_squares(innovation, judged)[:, 0], np.cumsum([len(own) for _, own in episodes])[:-1])
+        innovation, judged = (np.concatenate(parts) for parts in zip(*episodes, strict=True))
+        return np.split(self.mean_squares(innovation, judged), np.cumsum([len(own) for _, own in episodes])[:-1])
 
     def _remembered(self, squares: Array) -> Array:
         """Return the means of squares, shape (n_samples, q, bands), after every sample."""
@@ -123,7 +110,7 @@ def octaves(count: int = 6, quality: float = 1.4) -> Array:
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
 
 
-def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
+def judged_samples(settle: int, status: AnyArray, starts: Flags, moving: Flags) -> Flags:
     """Return which samples are judged, as a running observer does it; status and flags (n_samples, batch)."""
     judged, wait = np.zeros(status.shape, dtype=bool), np.zeros(status.shape[1], dtype=int)
     for k in range(len(status)):

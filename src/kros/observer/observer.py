@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Parameters
 from ..core.lti import gain
 from ..lifting import Lifting
 from ..synthesis.result import Injection
@@ -16,8 +16,6 @@ from .data import ObserverData
 from .file import read_observer, write_observer
 from .running import RunningObserver
 from .simulate import run_observer
-
-Array = npt.NDArray[np.float64]
 
 
 class Observer(ObserverData):
@@ -51,13 +49,11 @@ class Observer(ObserverData):
         controller = gain(np.zeros((len(A), len(measured))), sample_period_s)
         return cls(name, lifting, A, B, measured, inputs, controller, Injection.STATE, sample_period_s)
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch of episodes; see `run_observer`."""
         return run_observer(self, y, u, parameters)
 
-    def start(
-        self, y: npt.ArrayLike, parameters: Mapping[str, float] | None = None, /, **own: float
-    ) -> RunningObserver:
+    def start(self, y: ArrayLike, parameters: Mapping[str, float] | None = None, /, **own: float) -> RunningObserver:
         """Return a running observer that starts at a first measurement, shape (q,).
 
         The machine's own lifting parameters are given by name, ``start(y, phase=1.2)``, or as a mapping; the nominal

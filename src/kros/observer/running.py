@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, Array, ArrayLike
 from ..core.errors import ConfigError, DimensionError
 from .data import ObserverData
 from .monitor import Watch
@@ -18,8 +18,6 @@ from .screen import LONGEST, Held, SampleStatus, Screen, Screened
 from .simulate import Course, stepped
 from .step import forward
 from .tracking import PhaseLockedLoop
-
-Array = npt.NDArray[np.float64]
 
 
 class Estimate(Mapping[str, float]):
@@ -50,7 +48,7 @@ class Estimate(Mapping[str, float]):
     def __len__(self) -> int:
         return len(self._places)
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyArray:
         return np.array(self._array, dtype=dtype, copy=copy)
 
     def __repr__(self) -> str:
@@ -79,7 +77,7 @@ class RunningObserver:
     (0.75, True)
     """
 
-    def __init__(self, observer: ObserverData, y: npt.ArrayLike, parameters: Mapping[str, float]) -> None:
+    def __init__(self, observer: ObserverData, y: ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
         self._screen, self._course = Screen.of(observer), Course(observer, 1, parameters)
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
@@ -123,7 +121,7 @@ class RunningObserver:
         """Level of the innovation over its bound in dB, above zero outside; None without a monitor."""
         return None if self._watch is None else self._watch.level_db
 
-    def reset(self, y: npt.ArrayLike) -> None:
+    def reset(self, y: ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         first = self._sample(y)
         self._status, self._fresh = SampleStatus(int(first.status[0, 0])), bool(np.isfinite(first.y).any())
@@ -140,7 +138,7 @@ class RunningObserver:
         """One-step prediction: the state at k from what arrived up to k - 1."""
         return self._forward(self._course.steps.x)
 
-    def filter(self, y: npt.ArrayLike) -> Estimate:
+    def filter(self, y: ArrayLike) -> Estimate:
         """Return the estimate for k from what arrived up to k, y (q,), NaN where missing; nothing moves on."""
         o, steps = self.observer, self._course.steps
         if len(self._course.ahead()) < o.runtime.delay:
@@ -149,7 +147,7 @@ class RunningObserver:
         nu = np.where(np.isfinite(given), steps.innovation(given), 0.0)
         return self._forward(steps.x + nu @ self._filter_gain.T)
 
-    def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Estimate:
+    def step(self, y: ArrayLike, u: ArrayLike) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
 
         Parameters
@@ -188,13 +186,13 @@ class RunningObserver:
             self._status |= SampleStatus.UNCERTIFIED
         return self.estimate
 
-    def _sample(self, y: npt.ArrayLike, u: npt.ArrayLike | None = None, held: Held | None = None) -> Screened:
+    def _sample(self, y: ArrayLike, u: ArrayLike | None = None, held: Held | None = None) -> Screened:
         """Return a sample as the observer takes it; inputs are zero where none are known yet."""
         inputs = self.observer.inputs
         y, u = self._shaped(y, "measurements", self.observer.outputs), np.zeros(len(inputs)) if u is None else u
         return self._screen.take(y[None, None], self._shaped(u, "inputs", inputs)[None, None], held)
 
-    def _shaped(self, values: npt.ArrayLike, what: str, names: Sequence[str]) -> Array:
+    def _shaped(self, values: ArrayLike, what: str, names: Sequence[str]) -> Array:
         array = np.array(values, dtype=float, ndmin=1)  # a copy: the caller may use its memory again
         if array.shape != (len(names),):
             raise DimensionError(

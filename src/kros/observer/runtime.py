@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import DataError
-from ..core.linalg import floats
-
-Array = npt.NDArray[np.float64]
+from .checked import floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +39,7 @@ class Seen:
     inputs: Array
 
     def __post_init__(self) -> None:
-        floats(self, "measured", "inputs")
-        for name, values in vars(self).items():
-            if values.ndim != 1 or not np.isfinite(values).all() or np.any(values < 0):
-                raise DataError(
-                    f"Sizes seen in training: {name} should be one finite size of at least 0 a channel, found {values}."
-                )
-
-    def times(self, measured: Array, inputs: Array) -> Seen:
-        """Return the sizes in other units of measure, by the factors of measurements, (q,), and inputs, (m,)."""
-        return Seen(self.measured * measured, self.inputs * inputs)
+        floats(self, "Sizes seen in training", **dict.fromkeys(vars(self), "finite and not negative"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +77,7 @@ class Runtime:
         what = "Runtime of an observer"
         if int(self.delay) != self.delay or self.delay < 0:
             raise DataError(f"{what}: the delay of {self.delay} should be a whole number of samples, at least 0.")
-        floats(self, *self.limits())
-        for name in self.limits():
-            if np.isnan(getattr(self, name)).any():
-                raise DataError(f"{what}: {name} is not a number; leave limits out, or make them infinite.")
+        floats(self, what, **dict.fromkeys(self.limits(), "numbers"))
         if len(self.limits()) > 1 and np.any(np.greater(*self.limits().values())):
             raise DataError(f"{what}: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
 
@@ -106,10 +90,6 @@ class Runtime:
         limits = self.limits()
         return limits.get("lower", np.full(n, -np.inf))[:n], limits.get("upper", np.full(n, np.inf))[:n]
 
-    def limited_states(self, n: int) -> list[int]:
-        """Return which of n states have limits."""
-        return np.flatnonzero(np.isfinite(self.sides(n)).any(axis=0)).tolist()
-
     def binds(self, x: Array) -> bool:
         """Whether an estimate, (n,), meets a limit."""
         low, high = self.sides(len(x))
@@ -118,18 +98,6 @@ class Runtime:
     def clip_estimate(self, x: Array, out: Array | None = None) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
         return np.clip(x, *self.sides(x.shape[-1]), out=out) if self.limits() else x
-
-    def times(self, x: Array) -> Runtime:
-        """Return the same in other units of measure, by the factors of the states."""
-        changes: dict[str, Any] = {name: limit * x for name, limit in self.limits().items()}
-        return replace(self, **changes)
-
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any]) -> Runtime:
-        """Read the fields that a file holds; null stands for what is infinite."""
-        ends = {name: end for name, end in (("lower", -np.inf), ("upper", np.inf)) if content.get(name)}
-        limits = {name: np.nan_to_num(np.array(content[name], dtype=float), nan=end) for name, end in ends.items()}
-        return cls(content.get("delay") or 0, **limits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +110,12 @@ class Guard:
     settle: int  # samples after a start until the estimate is as good as before
 
     def __post_init__(self) -> None:
-        floats(self, "lower", "upper", "correction")
-        if not (np.all(self.lower < self.upper) and np.all(self.correction > 0) and self.settle >= 0):
+        what = "Guard of an observer"
+        floats(self, what, lower="numbers", upper="numbers", correction="positive")
+        if not (np.all(self.lower < self.upper) and self.settle >= 0):
             raise DataError(
-                f"Guard of an observer: lower bounds {self.lower} should be below the upper ones {self.upper}, sizes "
-                f"{self.correction} of the correction above zero, and {self.settle} samples to settle at least 0."
+                f"{what}: lower bounds {self.lower} should be below the upper ones {self.upper}, and {self.settle} "
+                "samples to settle at least 0."
             )
 
     def turned(self, turn: Array) -> Guard:

@@ -21,22 +21,18 @@ and a start costs no more than a start. Parameters stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Bits, Flags, Index
 from ..core.errors import DimensionError
 from .data import ObserverData
 from .runtime import Seen
 
-Array = npt.NDArray[np.float64]
-Bits = npt.NDArray[np.uint8]
-Whole = npt.NDArray[np.intp]
-Flags = npt.NDArray[np.bool_]
 BEYOND = 1.5  # times the range: what is further away is implausible
 _SIGNALS = ("y", "u", "status", "starts", "complete")
 LONGEST = 5  # samples for which an input may be held without a new start
@@ -82,7 +78,7 @@ class Held:
     """Inputs held from sample to sample."""
 
     inputs: Array  # (batch, m)
-    since: Whole  # (batch, m)
+    since: Index  # (batch, m)
     stale: Flags  # (batch,)
 
     @classmethod
@@ -102,11 +98,6 @@ class Screened:
     complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
 
-    def of(self, members: Sequence[int] | Whole) -> Screened:
-        """Return the samples of some members of the batch."""
-        held = Held(*(value[members] for value in vars(self.held).values()))
-        return replace(self.each(lambda name: getattr(self, name)[:, members]), held=held)
-
     def rows(self, part: slice) -> Screened:
         """Return some samples of all members."""
         return self.each(lambda name: getattr(self, name)[part])
@@ -118,16 +109,6 @@ class Screened:
     def each(self, signal: Callable[[str], Any]) -> Screened:
         """Return the same with other signals, by name."""
         return replace(self, **{name: signal(name) for name in _SIGNALS})
-
-
-def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:
-    """Refuse measurements and inputs that do not fit together, or to an observer."""
-    n_samples, batch = y.shape[:2] if y.ndim == 3 and len(y) else (1, 0)
-    if (y.shape, u.shape) != ((n_samples, batch, measured), (n_samples, batch, len(inputs))):
-        raise DimensionError(
-            f"Running {who}: expected {measured} measurements and the inputs {tuple(inputs)} on the last axes of y and "
-            f"u, (n_samples, batch, .), with at least one sample, found shapes {y.shape} and {u.shape}."
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,10 +161,15 @@ class Screen:
         return Screened(y, inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))
 
 
-def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike, held: Held | None = None) -> Screened:
+def screened(observer: ObserverData, y: ArrayLike, u: ArrayLike, held: Held | None = None) -> Screened:
     """Return a batch of samples as an observer takes them; `held` is known before the first."""
-    y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
-    require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)
+    y, u, q, inputs = np.asarray(y, float), np.asarray(u, float), len(observer.measured), observer.inputs
+    n_samples, batch = y.shape[:2] if y.ndim == 3 and len(y) else (1, 0)
+    if (y.shape, u.shape) != ((n_samples, batch, q), (n_samples, batch, len(inputs))):
+        raise DimensionError(
+            f"Running observer {observer.name}: expected {q} measurements and the inputs {tuple(inputs)} on the last "
+            f"axes of y and u, (n_samples, batch, .), with at least one sample, found shapes {y.shape} and {u.shape}."
+        )
     return Screen.of(observer).take(y, u, held)
 
 

@@ -1,4 +1,4 @@
-r"""What is declared of a machine's sensors, and the limits that recordings show.
+r"""What is declared of a machine's sensors.
 
 What arrives at sample k of a measured channel y is
 
@@ -13,15 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from ..core.errors import ConfigError
 from ..core.settings import Settings
-from ..identify.flat_tops import FoundLimit
-
-Array = npt.NDArray[np.float64]
 
 
 class Sensor(Settings):
@@ -55,11 +50,6 @@ class Sensor(Settings):
         """Return the same with at least the resolution that recordings show."""
         return self.model_copy(update={"resolution": max(self.resolution or 0.0, resolution)})
 
-    def in_unit(self, size: float) -> Sensor:
-        """Return the same for a channel that is divided by a size."""
-        resolution = None if self.resolution is None else self.resolution / size
-        return self.model_copy(update={"noise": self.noise / size, "bias": self.bias / size, "resolution": resolution})
-
 
 Sensors = Mapping[str, Sensor]
 
@@ -85,12 +75,9 @@ def delay_of(sensor: Sensors) -> int:
 
 def in_units(sensor: Sensors, sizes: Mapping[str, float]) -> dict[str, Sensor]:
     """Return sensors of channels that are divided by sizes, by name; one that is not named stays as it is."""
-    return {name: own.in_unit(sizes.get(name, 1.0)) for name, own in sensor.items()}
-
-
-def sides(limits: Mapping[str, FoundLimit], states: Sequence[str]) -> tuple[Array, Array]:
-    """Return lower and upper limits that states reached in recordings, infinite where there is none."""
-    ends = [(limits[name].lower, limits[name].upper) if name in limits else (None, None) for name in states]
-    known = np.array(ends, dtype=float)
-    lower, upper = np.where(np.isnan(known), [-np.inf, np.inf], known).T
-    return lower, upper
+    found = {}
+    for name, own in sensor.items():
+        given = {key: getattr(own, key) for key in ("noise", "bias", "resolution")}
+        changed = {key: value / sizes.get(name, 1.0) for key, value in given.items() if value is not None}
+        found[name] = own.model_copy(update=changed)
+    return found

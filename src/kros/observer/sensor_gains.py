@@ -12,15 +12,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.lti import StateSpace
 from ..core.norms import gramian
 from ..core.rounding import AGREED
 from ..loops.filtering import recursion
 from .data import ObserverData
 
-Array = npt.NDArray[np.float64]
 BLOCK = 4096  # samples of an impulse response that are in memory
 SLOWEST = 100_000  # samples: of a longer time constant, an impulse response is too long to sum
 
@@ -65,4 +64,4 @@ def _bounded(system: StateSpace) -> Array:
         added = np.abs(states @ system.C.T).sum(axis=0)
         total, x = total + added, states[-1] @ system.A.T
         if np.all(added <= AGREED * total):
-            return np.asarray(total.T)
+            return total.T

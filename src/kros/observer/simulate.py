@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..loops import Library, formulas, library, tape_of
+from ..core.arrays import Array, Bits, Flags, Index, Parameters
+from ..loops import Library, formulas, library
 from .data import ObserverData
 from .monitor import judged_samples
 from .runtime import bounds
-from .screen import Bits, Flags, Held, SampleStatus, Screened, Whole, screened
-from .step import Parameters, Steps, forward
+from .screen import Held, SampleStatus, Screened, screened
+from .step import Steps, forward
 
-Array = npt.NDArray[np.float64]
 _ROWS = 1000  # samples predicted forward at a time
 
 
@@ -24,7 +23,7 @@ def run_observer(
     observer: ObserverData,
     y: Array,
     u: Array,
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    parameters: Parameters | None = None,
 ) -> Array:
     """Run an observer over a batch of episodes.
 
@@ -64,49 +63,34 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return _run([observer], screened(observer, y, u), parameters)[0].estimates
+    return run_observers([observer], y, u, parameters)[0]
 
 
-def run_observers(
-    observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
-) -> Array:
+def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Parameters | None = None) -> Array:
     """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
-    first = observers[0]
-    if len(observers) > 1 and (first.bank is not None or (first.runtime.delay and first.lifting.history)):
-        return np.stack([run_observer(o, y, u, parameters) for o in observers])
-    return np.stack([run.estimates for run in _run(observers, screened(first, y, u), parameters)])
+    samples = screened(observers[0], y, u)
+    courses = [Course(observer, samples.starts.shape[1], parameters) for observer in observers]
+    return np.stack([run.estimates for run in _run(courses, samples)])
 
 
 def run_innovations(
-    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None, settle: int = 0
+    observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, settle: int = 0
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
-    samples = screened(observer, y, u)
-    run = _run([observer], samples, parameters)[0]
+    run = Course(observer, y.shape[1], parameters).take(y, u)
     run.starts[0] = True
-    return run.innovation, judged_samples(settle, samples.status | run.status, run.starts, run.moving)
+    return run.innovation, judged_samples(settle, run.status, run.starts, run.moving)
 
 
-def _run(
-    observers: Sequence[ObserverData],
-    samples: Screened,
-    parameters: Parameters | None,
-) -> list[Stepped]:
-    """Run observers of one model: compiled, and in NumPy again the machines that leave bounds or have gaps to fill."""
-    loops, batch = library(), samples.starts.shape[1]
-    courses = [Course(o, batch, parameters) for o in observers]
-    if loops is None:
-        runs = [stepped(course, samples) for course in courses]
-    else:
-        runs, again = _compiled(loops, courses, samples)
-        if observers[0].bank is not None:
-            again = again | ~np.isfinite(samples.y).all(axis=(0, 2))
-        for run, course, some in zip(runs, courses, again, strict=True):
-            if some.any():
-                run.replace(np.flatnonzero(some), course, samples)
-    for run, observer in zip(runs, observers, strict=True):
-        observer.runtime.clip_estimate(run.estimates, out=run.estimates)
-    return runs
+def _run(courses: Sequence[Course], samples: Screened) -> list[Stepped]:
+    """Run observers of one model on: compiled where they go on side by side within their bounds, else in NumPy."""
+    loops, runs = library(), list[Stepped | None]([None] * len(courses))
+    if loops is not None and all(course.even(samples) for course in courses):
+        runs = _compiled(loops, courses, samples)
+    finished = [run or stepped(course, samples) for run, course in zip(runs, courses, strict=True)]
+    for run, course in zip(finished, courses, strict=True):
+        course.observer.runtime.clip_estimate(run.estimates, out=run.estimates)
+    return finished
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,13 +103,6 @@ class Stepped:
     starts: Flags  # (n_samples, batch)
     moving: Flags  # (n_samples, batch)
     followed: Array  # (n_samples, batch): the parameter that a loop follows
-
-    def replace(self, machines: Whole, course: Course, samples: Screened) -> None:
-        """Put what some machines do in NumPy in the place of what they did, from the first sample of all."""
-        own = {name: v[machines] for name, v in course.values.items()}
-        part = stepped(Course(course.observer, len(machines), own), samples.of(machines))
-        for name in ("estimates", "innovation", "status", "starts", "moving"):
-            getattr(self, name)[:, machines] = getattr(part, name)
 
 
 class Course:
@@ -165,20 +142,16 @@ class Course:
     def take(self, y: Array, u: Array) -> Stepped:
         """Run over the next samples, y (n_samples, batch, q) and u (n_samples, batch, m), with the bits of all."""
         samples = screened(self.observer, y, u, self.held)
-        loops, run = library(), None
-        if loops is not None and self.even(samples):
-            (run,), restarted = _compiled(loops, [self], samples)
-        if run is None or restarted.any():
-            run = stepped(self, samples)
-        self.observer.runtime.clip_estimate(run.estimates, out=run.estimates)
+        (run,) = _run([self], samples)
         return replace(run, status=run.status | samples.status)
 
     def even(self, samples: Screened) -> bool:
-        """Whether the compiled loop can run on: nothing waits, settles, fills a gap or follows."""
-        gaps = self.steps.gaps
-        lost = gaps is not None and not np.isfinite(samples.y).all()
-        filled = gaps is not None and bool(gaps.age.any() or samples.starts[-1].any())
-        return self.loop is None and not (lost or filled or self.steps.waiting.any() or self.settling.any())
+        """Whether machines go on side by side: none starts again, settles, fills a gap, follows or looks far back."""
+        steps, starts = self.steps, samples.starts[self._before is None :]
+        gaps = steps.gaps is not None and bool(steps.gaps.age.any() or not np.isfinite(samples.y).all())
+        far = self.observer.runtime.delay and self.observer.lifting.history
+        apart = starts.any() or steps.waiting.any() or self.settling.any() or np.ptp(self.since)
+        return not (gaps or far or apart or self.loop is not None)
 
     def enter(self, samples: Screened) -> tuple[Screened, int]:
         """Start at the first sample of all; return samples behind those that inputs are still needed of, a number."""
@@ -235,15 +208,8 @@ def stepped(course: Course, samples: Screened) -> Stepped:
     return Stepped(x[lead:], nu[lead:], status[lead:], starts[lead:], moving[lead:], followed[lead:])
 
 
-def _pending(starts: Flags, delay: int, since: npt.ArrayLike = -1) -> Whole:
-    """Samples between a state and the row that it is recorded in, (n_samples, batch); `since` before the first."""
-    row, first = np.arange(len(starts))[:, None], np.broadcast_to(-1 - np.asarray(since), (1, starts.shape[1]))
-    begun = np.maximum.accumulate(np.where(starts, row, first), axis=0)
-    return np.minimum(row - np.concatenate([first, begun[:-1]]), delay)
-
-
 def _predict(
-    observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Mapping[str, Array]
+    observer: ObserverData, x: Array, earlier: Array, pending: Index, samples: Screened, values: Mapping[str, Array]
 ) -> None:
     """Predict states (n_samples, batch, n) to their rows, without correction."""
     batch = x.shape[1]
@@ -257,88 +223,65 @@ def _predict(
         x[rows] = forward(observer, each, count.ravel(), *signals).reshape(len(rows), batch, -1)
 
 
-def _compiled(
-    loops: Library,
-    courses: Sequence[Course],
-    samples: Screened,
-) -> tuple[list[Stepped], Flags]:
-    """Run observers of one model on in the compiled loop; return which machines left bounds, (observer, batch)."""
+def _compiled(loops: Library, courses: Sequence[Course], samples: Screened) -> list[Stepped | None]:
+    """Run observers of one model on in the compiled loop; those that would leave their bounds stay where they were."""
     (samples, lead), *_ = [course.enter(samples) for course in courses]
-    observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay
-    (n_samples, batch), n, m = samples.starts.shape, observers[0].lifting.n_states, samples.u.shape[2]
-    late = np.zeros((lead, batch), dtype=np.intp), _pending(samples.starts[lead:], delay, courses[0].since)
-    pending, states = np.concatenate(late), np.empty((n_samples, len(observers), n, batch))
-    innovation = np.empty(samples.y.shape)  # of the first observer
-    job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states, "innovation": innovation}
-    before = np.empty((n_samples, batch, job["past"].shape[-1]))
-    moving = (pending == delay) & (~samples.starts | (delay == 0))
-    if delay:
-        job |= {"moving": moving, "before": before, "pending": pending}
-    tape = formulas(observers[0].lifting, tape_of(observers[0].lifting, m), values, m, batch)
-    loops.call("kros_relift", tape, ("relift_job", job))
-    runs, restarted = [], job["restart"].view(bool)
+    observer, values, since = courses[0].observer, courses[0].values, int(courses[0].since[0])
+    (n_samples, batch), delay, lifting = samples.starts.shape, observer.runtime.delay, observer.lifting
+    late = np.clip(np.arange(n_samples) - lead + since + 1, 0, delay)  # samples between a state and its row
+    first = min(lead + delay - int(late[lead]), n_samples)  # which a measurement corrects
+    states = np.empty((n_samples, len(courses), lifting.n_states, batch))
+    states[:first] = [course.steps.x.T for course in courses]
+    job = _job(courses, samples.rows(slice(first, None)), samples.u[first - delay : n_samples - delay])
+    of_lifting = formulas(lifting, values, samples.u.shape[2], batch)
+    loops.call("kros_relift", of_lifting, ("relift_job", job | {"states": states[first:]}))
+    moving = np.broadcast_to(np.arange(lead, n_samples)[:, None] >= first, (n_samples - lead, batch))
+    runs, n, nl = list[Stepped | None](), lifting.n_states, lifting.n_lifted
     for i, course in enumerate(courses):
-        x = states[:, i].swapaxes(1, 2)
-        if not restarted[i].any():
-            course.since = np.where(samples.starts[-1], 0, pending[-1])
-            _put(course, {name: job[name][i] for name in ("column", "past")}, job["fresh"], x[-1], samples)
+        if job["left"][i]:
+            runs.append(None)
+            continue
+        x, steps, column = states[:, i].swapaxes(1, 2), course.steps, job["column"][i]
+        steps.x, steps.x_c = column[:n].T.copy(), column[nl : nl + steps.x_c.shape[1]].T.copy()
+        steps.past, steps.fresh = job["past"][i], steps.fresh & (first == n_samples)
+        if steps.gaps is not None:
+            steps.gaps.offset = steps.gaps.apart(x[-1], samples.y[-1])
+        course.since[:] = late[-1]
+        course.leave(samples)
+        innovation = np.where(np.isfinite(samples.y), samples.y - x[..., list(observer.measured)], 0.0)
         if delay:
+            pending = np.broadcast_to(late[:, None], (n_samples, batch))
             with np.errstate(over="ignore", invalid="ignore"):
-                _predict(course.observer, x, before, pending, samples, values)
-        status, starts = np.zeros((n_samples - lead, batch), np.uint8), samples.starts[lead:].copy()
-        runs.append(Stepped(x[lead:], innovation[lead:], status, starts, moving[lead:].copy(), np.empty(0)))
-    return runs, restarted
+                _predict(course.observer, x, np.empty((n_samples, batch, 0)), pending, samples, values)
+        status, starts = np.zeros((2, n_samples - lead, batch), np.uint8)
+        runs.append(Stepped(x[lead:], innovation[lead:], status, starts.view(bool), moving, np.empty(0)))
+    return runs
 
 
-def _job(courses: Sequence[Course], samples: Screened) -> dict[str, Any]:
-    """Return what the compiled loop starts from."""
+def _job(courses: Sequence[Course], samples: Screened, u: Array) -> dict[str, Any]:
+    """Return what the compiled loop starts from, with the inputs of the moments at which samples were measured."""
     observer, order = courses[0].observer, max(c.observer.controller.n_states for c in courses)
     (n_samples, batch), (n, nl) = samples.starts.shape, (observer.lifting.n_states, observer.lifting.n_lifted)
-    waiting, restarted = np.zeros((2, len(courses), batch), np.uint8)
     job: dict[str, Any] = {
         "observers": len(courses),
         "samples": n_samples,
         "batch": batch,
         "order": order,
         "q": len(observer.measured),
-        "late": observer.runtime.delay,
         "overwrite": int(observer.bank is not None),
         "map": np.stack([_padded(c.observer, order) for c in courses]),
         "y": samples.y.swapaxes(1, 2),
-        "u": samples.u.swapaxes(1, 2),
+        "u": u.swapaxes(1, 2),
         "measured": observer.measured,
         "past": np.stack([c.steps.past for c in courses]),
-        "fresh": courses[0].steps.fresh.astype(np.uint8),
-        "waiting": waiting,
-        "restart": restarted,
+        "fresh": int(courses[0].steps.fresh.any()),
+        "left": np.zeros(len(courses), np.uint8),
     }
     job["low"], job["high"] = np.swapaxes([bounds(c.observer.guard, n, order) for c in courses], 0, 1)
     job["column"] = np.zeros((len(courses), job["map"].shape[2], batch))
     for column, course in zip(job["column"], courses, strict=True):
         column[:n], column[nl : nl + course.steps.x_c.shape[1]] = course.steps.x.T, course.steps.x_c.T
     return job
-
-
-def _put(course: Course, left: Mapping[str, Array], fresh: Bits, last: Array, samples: Screened) -> None:
-    """Put what the compiled loop left into an observer; `last` is its estimate at the last sample, (batch, n)."""
-    steps, n, nl = course.steps, course.observer.lifting.n_states, course.observer.lifting.n_lifted
-    steps.x, steps.x_c = left["column"][:n].T.copy(), left["column"][nl : nl + steps.x_c.shape[1]].T.copy()
-    steps.past, steps.fresh = left["past"], fresh.view(bool)
-    if steps.gaps is not None:
-        steps.gaps.offset = steps.gaps.apart(last, samples.y[-1])
-    course.leave(samples)
-
-
-def _begins(observers: Sequence[ObserverData], samples: Screened, values: Mapping[str, Array]) -> dict[str, Any]:
-    """Return the estimates of machines that start after the first sample of all, and which they are."""
-    rows, machines = np.nonzero(samples.starts)
-    if not len(rows):
-        return {}
-    number = np.zeros(samples.starts.shape, dtype=np.int32)
-    number[rows, machines] = 1 + np.arange(len(rows))
-    each = {p: v[machines] for p, v in values.items()}
-    first = [o.initial(samples.y[rows, machines], each, samples.u[rows, machines]) for o in observers]
-    return {"begin": number, "begun": np.stack(first), "begins": len(rows)}
 
 
 def _padded(observer: ObserverData, order: int) -> Array:

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Flags, Index, Parameters
 from .data import ObserverData
 from .filter_bank import Gaps
 from .runtime import bounds
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
-Parameters = Mapping[str, npt.ArrayLike]
 
 
 class Steps:
@@ -76,9 +71,7 @@ class Steps:
             self.fresh &= ~on[:, 0]
 
 
-def forward(
-    observer: ObserverData, values: Parameters, count: npt.NDArray[np.intp], x: Array, earlier: Array, u: Array
-) -> Array:
+def forward(observer: ObserverData, values: Parameters, count: Index, x: Array, earlier: Array, u: Array) -> Array:
     """Predict states (batch, n) over the first ``count`` inputs of u (d, batch, m), without correction."""
     steps, missing = Steps(observer, len(x), values), np.full((len(x), len(observer.measured)), np.nan)
     steps.x[...], steps.past[...], steps.fresh[:] = x, earlier, False

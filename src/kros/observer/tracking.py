@@ -24,14 +24,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Flags, Whole
 from ..core.errors import ConfigError
 from .data import ObserverData
 from .simulate import run_observer
-from .step import Flags, Steps
+from .step import Steps
 
-Array = npt.NDArray[np.float64]
 MOST = 1.0  # largest error of the parameter that is corrected at once: transients at the start show more
 
 
@@ -101,10 +100,10 @@ def least_innovation(
     observer: ObserverData,
     y: Array,
     u: Array,
-    lengths: npt.NDArray[np.int64],
+    lengths: Whole,
     parameters: Mapping[str, float],
     name: str,
-    candidates: npt.ArrayLike,
+    candidates: ArrayLike,
 ) -> float:
     """Return the candidate of a parameter with the smallest innovation over episodes of one machine."""
     values, batch, k = np.asarray(candidates, dtype=float), y.shape[1], np.arange(len(y))[:, None]

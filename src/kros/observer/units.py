@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import DataError
 from ..core.files import shortened
 from ..core.lti import StateSpace
@@ -23,7 +23,6 @@ from ..synthesis.result import Injection
 from .data import ObserverData
 from .sensor import in_units
 
-Array = npt.NDArray[np.float64]
 O = TypeVar("O", bound=ObserverData)  # noqa: E741
 
 
@@ -34,15 +33,21 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     y, K = x[list(observer.measured)], observer.controller
     into = u if observer.injection is Injection.INPUT else x
     observer = in_coordinates(observer, np.diag(x))
-    by = {"seen": (y, u[: len(observer.inputs)]), "monitor": (y,), "bank": (np.concatenate([x, u]), y)}
-    parts = {name: getattr(observer, name) for name in by}
-    changed: dict[str, Any] = {name: part.times(*by[name]) for name, part in parts.items() if part is not None}
+    by: dict[str, dict[str, Array]] = {
+        "seen": {"measured": y, "inputs": u[: len(observer.inputs)]},
+        "monitor": {"size": y},
+        "bank": {"start": 1 / np.concatenate([x, u]), "reach": y},
+        "runtime": dict.fromkeys(observer.runtime.limits(), x[: lifting.n_states]),
+    }
+    parts = {name: part for name in by if (part := getattr(observer, name)) is not None}
+    changed = {
+        name: replace(p, **{key: getattr(p, key) * v for key, v in by[name].items()}) for name, p in parts.items()
+    }
     return replace(
         observer,
         lifting=lifting,
         B=observer.B / u,
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
-        runtime=observer.runtime.times(x[: lifting.n_states]),
         sensor=in_units(observer.sensor, dict(zip(observer.outputs, (1 / y).tolist(), strict=True))),
         **changed,
     )
@@ -100,7 +105,7 @@ def recorded_channel(observer: ObserverData, name: str) -> RecordedChannel:
     return RecordedChannel(factor, unit_of_factor(factor, unit) or f"{factor:.6g} {unit or 'of the study'}", note)
 
 
-def recorded_factors(observer: ObserverData, names: Sequence[str]) -> npt.NDArray[np.float64]:
+def recorded_factors(observer: ObserverData, names: Sequence[str]) -> Array:
     """Return the factor of every channel: its value is the factor times the recorded one."""
     return np.array([recorded_channel(observer, name).factor for name in names])
 

@@ -5,7 +5,6 @@ What was not run is absent, what is unknown is null, nothing is invented.
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 from ..core.artifacts import load_artifact, plain
@@ -53,10 +52,8 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "resolution": facts.resolution,
         "dropped": facts.dropped,
     }
-    limits = {s: facts.limits[s] for s in population.states if s in facts.limits}
     optional = {
         "sensor": {name: one.model_dump(exclude_none=True) for name, one in sensor.items()},
-        "limits": {s: {"lower": one.lower, "upper": one.upper, "seen": asdict(one)} for s, one in limits.items()},
         "alerts": facts.alerts,
     }
     study |= {name: value for name, value in optional.items() if value}

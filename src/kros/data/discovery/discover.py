@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arrays import Array
 from ...core.errors import ConfigError, DataError
 from ...core.files import did_you_mean
 from ...core.work import Work
 from ..measures import split_header
-from ..population import Array, EpisodeKey, Population
+from ..population import EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder
 from ..readers.tables import Dialect, file_fields, read_blocks
 from ..recording import CHECK, some, usable

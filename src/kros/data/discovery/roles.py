@@ -13,8 +13,8 @@ from enum import Enum
 
 import numpy as np
 
+from ...core.arrays import Array
 from ..measures import KINDS, Measure, clean_unit, measure, split_header
-from ..population import Array
 from ..recording import CHECK
 
 WORDS = {

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ...core.arrays import Array
 from ...core.errors import DataError
 from ...core.files import shortened
-from ..population import DEFAULT_CONDITION, Array, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
+from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_period, title
 

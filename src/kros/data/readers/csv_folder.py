@@ -16,13 +16,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
+from ...core.arrays import Array
 from ...core.errors import DataError
 from ...core.files import did_you_mean, read_toml
 from ...core.settings import Settings
 from ..measures import clean_unit, measure, split_header
 from ..population import (
     DEFAULT_CONDITION,
-    Array,
     Channel,
     EpisodeKey,
     Population,

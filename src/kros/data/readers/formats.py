@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from ...core import limits
+from ...core.arrays import Array
 from ...core.errors import DataError, MissingDependencyError
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of
-from ..population import Array
 from ..recording import some
 
 Group = tuple[Mapping[str, Any], Mapping[str, str]]

@@ -22,10 +22,11 @@ from urllib.parse import quote
 
 import numpy as np
 
+from ...core.arrays import Array
 from ...core.artifacts import load_artifact, save_artifact, united
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
-from ..population import Array, Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
+from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_structure, refuse_copies, usable_episodes
 from .tables import BLOCK, from_numpy, repeated, to_numpy

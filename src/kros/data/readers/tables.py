@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core import limits
+from ...core.arrays import Array
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened
 from ..measures import clean_unit, is_unit_row, split_header
-from ..population import Array
 from .formats import columns_of, is_binary, values_of
 
 # cells of spreadsheets without a number

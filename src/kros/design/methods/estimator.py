@@ -30,11 +30,7 @@ class Estimator(Method):
         channels = models.lifting, models.measured, models.recorded_inputs
         settings = models.sample_period_s, models.parameters_of(task.unit), self.settings
         identified = identify_estimator(task.name, *channels, recordings, *settings)
-        runtime, n = identified.observer.runtime, len(task.limits[0])
-        lower, upper = (side.copy() for side in runtime.sides(identified.observer.lifting.n_states))
-        lower[:n], upper[:n] = np.maximum(lower[:n], task.limits[0]), np.minimum(upper[:n], task.limits[1])
-        runtime = replace(runtime, lower=lower, upper=upper)
-        observer = replace(identified.observer, runtime=runtime, seen=self._seen(task), sensor=task.sensor)
+        observer = replace(identified.observer, seen=self._seen(task), sensor=task.sensor)
         seconds = time.perf_counter() - began
         synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)
         return Design(task.name, observer, synthesis, identified.facts)

@@ -5,17 +5,27 @@ The residual-shaped observer runs rows fitted to single steps where these promis
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
+from ...core.arrays import Array
 from ...core.errors import SynthesisError
 from ...core.lti import gain
-from ...observer.baselines.kalman import kalman_candidates
-from ...observer.residual.models import one_step_rows, residual_models, with_rows
-from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance, one_step_residual
-from ...synthesis import Synthesis
+from ...observer.residual import (
+    like_measurement_noise,
+    mean_error_dynamics,
+    mean_slopes,
+    one_step_covariance,
+    one_step_residual,
+    one_step_rows,
+    residual_models,
+    with_rows,
+)
+from ...synthesis import Synthesis, kalman
 from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
 from ..task import Design, DesignTask, Method
 from ..validation import hidden_mean, percent_of
@@ -48,7 +58,7 @@ class KalmanTuned(Method):
         covariance = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
         dynamics = mean_error_dynamics(A, mean_slopes(lifting, *recorded, batch.parameters))
         noise, C = np.diag(task.noise**2), task.selector[:, :n]
-        candidates = kalman_candidates(dynamics, C, covariance, noise, models.sample_period_s)
+        candidates = _candidates(dynamics, C, covariance, noise, models.sample_period_s)
         tried = [(level, _padded(gains, lifting.n_lifted)) for level, gains in candidates]
         observers = [task.observer(gains, A, B) for _, gains in tried]
         errors = hidden_mean(percent_of(observers, batch), models.measured) if tried else np.array([np.inf])
@@ -60,6 +70,14 @@ class KalmanTuned(Method):
         level, gains = tried[first]
         facts = {"process_noise_level": level, "rows_fitted_to_single_steps": list(lifting.states)}
         return Design(task.name, observers[first], gains, facts)
+
+
+def _candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
+    """Sweep the size of white process noise over sixteen decades, the covariance itself among them."""
+    base = like_measurement_noise(C @ shape @ C.T, R)
+    for level in sorted((1 / base, *np.logspace(-6, 10, 9).tolist())):
+        with suppress(SynthesisError):
+            yield level, kalman(A, C, level * base * shape, R, dt)
 
 
 def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:

@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array, Bits
 from ...core.errors import ConfigError, DimensionError
 from ...loops.compiler import COMPILERS, compile_library, find_compiler
 
-Array = npt.NDArray[np.float64]
-Machine = npt.NDArray[np.uint8]  # the state of one machine, as the C source keeps it
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")
 # The loop over time, compiled beside the observer: what arrives and leaves lies sample after sample.
 _LOOP = """
@@ -94,8 +92,8 @@ class CompiledObserver:
         return int(self._c[f"{self.name}_selftest"]())
 
     def run(
-        self, y: Array, u: Array, parameters: Mapping[str, float] | None = None, machine: Machine | None = None
-    ) -> tuple[Array, npt.NDArray[Any]]:
+        self, y: Array, u: Array, parameters: Mapping[str, float] | None = None, machine: Bits | None = None
+    ) -> tuple[Array, AnyArray]:
         """Estimate one recording, sample by sample.
 
         Parameters
@@ -120,7 +118,7 @@ class CompiledObserver:
         self._run(_at(machine), ctypes.c_long(len(y)), *(_at(array) for array in (y, u, x_hat, status)))
         return x_hat, status
 
-    def start(self, y: Array, parameters: Mapping[str, float] | None = None) -> Machine:
+    def start(self, y: Array, parameters: Mapping[str, float] | None = None) -> Bits:
         """Return the state of a machine that starts at a measurement, shape (q,), as the C source keeps it."""
         machine = np.zeros(self.state_bytes, dtype=np.uint8)
         self._c[f"{self.name}_init"](_at(machine))
@@ -135,5 +133,5 @@ def _wide(manifest: Mapping[str, Any]) -> str:
     return "_wide" if manifest["precision"] == "float" else ""
 
 
-def _at(array: npt.NDArray[Any]) -> ctypes.c_void_p:
+def _at(array: AnyArray) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)

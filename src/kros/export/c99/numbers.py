@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.errors import ConfigError
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
@@ -19,11 +19,11 @@ from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
-from ..text import plain, plain_names
+from ..text import plain, plain_names, require_identifier
 from .origin import OriginShift, find_shift
 from .realise import RULE, realised
 
-Array = npt.NDArray[np.float64]
+TOLERANCE = {"double": 1e-9, "float": 1e-3}  # of golden vectors
 DOUBLE, SINGLE = Precision(), Precision("float")
 
 
@@ -66,6 +66,11 @@ class Source:
         cls, observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None
     ) -> Source:
         """Look at an observer; refuse what it cannot give."""
+        require_identifier(name)
+        for parameter in observer.lifting.parameters:
+            require_identifier(parameter, "parameter")
+        if precision not in TOLERANCE:
+            raise ConfigError(f"Export: precision should be {' or '.join(TOLERANCE)}, found {precision!r}.")
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
             raise ConfigError(f"Export: load torque needs {', '.join(missing)}, found {', '.join(observer.recorded)}.")
         observer = realised(observer)
@@ -250,7 +255,7 @@ class Source:
             **{name: self.row(getattr(own, name)) for name in ("forget", "reach", "half", "recovery")},
             "longest": self.row(longest_age(own.half)),
             "ramp": self.sums(o.A[z, z]),
-            "into": self.matrix(o.A[z][:, list(o.measured)]),
+            "into": self.row(o.A[z][:, list(o.measured)]),
             "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
         }
 
@@ -262,9 +267,9 @@ class Source:
         numbers = {"quiet": QUIET, "forget": own.forget, "first": max(own.first, own.forget), "largest": LARGEST}
         return {
             "bands": len(own.filters),
-            "filters": self.matrix(own.filters),
+            "filters": self.row(own.filters),
             "inverse_size": self.row(1 / own.size),
-            "inverse_limit": self.matrix(1 / own.limits),
+            "inverse_limit": self.row(1 / own.limits),
             "weights": own.weights.astype(int).tolist(),
             **{name: self.precision.literal(value) for name, value in numbers.items()},
             "settle": own.settle,
@@ -290,12 +295,8 @@ class Source:
         """Return what is multiplied by which entry of a column, row by row; zeros are left out."""
         return [[(int(j), self.precision.literal(float(row[j]))) for j in np.flatnonzero(row)] for row in values]
 
-    def matrix(self, values: Array) -> list[list[str]]:
-        """Return the literals of a matrix, row by row."""
-        return [self.row(numbers) for numbers in values]
-
-    def row(self, values: Array) -> list[str]:
-        """Return the literals of a row."""
+    def row(self, values: Array) -> list[Any]:
+        """Return the literals of numbers, row by row."""
         return row(values, self.precision)
 
     def code(self, expression: Any) -> str:
@@ -312,8 +313,10 @@ class Source:
         return [dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True)]
 
 
-def row(values: Array, precision: Precision = DOUBLE) -> list[str]:
-    """Return the literals of a row; infinity as the largest number."""
+def row(values: Array, precision: Precision = DOUBLE) -> list[Any]:
+    """Return the literals of numbers, row by row; infinity as the largest number."""
+    if values.ndim > 1:
+        return [row(one, precision) for one in values]
     return [precision.literal(v) for v in np.clip(values, -precision.largest, precision.largest).tolist()]
 
 

@@ -18,14 +18,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.rounding import EPS, ITERATED, TINY
 from ...lifting import Lifting
 from ...observer.data import ObserverData
 from .realise import RULE
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.rounding import ROUNDING
 from ...observer import Observer
 from ...observer.units import in_coordinates
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array
 from ...core.artifacts import json_bytes, with_checksum
-from ...core.errors import ConfigError
 from ...core.files import whole_folder, write_bytes
 from ...observer import Observer
 from ...observer.file import observer_content
-from ..text import rendered, require_identifier
-from .numbers import LoadOutput, Source
-
-_TOLERANCE = {"double": 1e-9, "float": 1e-3}
+from ..text import rendered
+from .numbers import TOLERANCE, LoadOutput, Source
 
 
 def export_c(
@@ -75,28 +73,17 @@ def export_c(
     ...     print("lag_step" in (written / "lag.h").read_text())
     True
     """
-    require_identifier(name)
-    if precision not in _TOLERANCE:
-        raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
-    files = c_files(observer, name, precision, track, load)
+    files = c_files(observer, Source.of(observer, name, precision, track, load))
     with whole_folder(Path(out)) as folder:
         for file, text in files.items():
             write_bytes(folder / file, text.encode())
     return Path(out)
 
 
-def c_files(
-    observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None
-) -> dict[str, str]:
+def c_files(observer: Observer, source: Source) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
-    for parameter in observer.lifting.parameters:
-        require_identifier(parameter, "parameter")
-    source = Source.of(observer, name, precision, track, load)
-    context = source.context() | {
-        "version": version("kros"),
-        "tolerance": _TOLERANCE[precision],
-        "golden": _golden(observer, source, track, _TOLERANCE[precision]),
-    }
+    name, track = source.name, None if source.loop is None else source.loop.name
+    context = source.context() | {"version": version("kros"), **_golden(observer, source, track)}
     context["state_bytes"] = _state_bytes(context)
     texts = {f"{name}.h": "observer.h", f"{name}.c": "observer.c", f"{name}_selftest.c": "selftest.c"}
     texts |= {file: file for file in ("example_main.c", "CMakeLists.txt", "README.md")}
@@ -104,13 +91,14 @@ def c_files(
     return rendered("kros.export.c99", texts, context) | {"manifest.json": json_bytes(manifest).decode()}
 
 
-def _golden(observer: Observer, source: Source, track: str | None, tolerance: float) -> dict[str, Any]:
-    """Return the literals of golden vectors in the units of the recordings."""
-    golden, factors = Golden.of(observer, track, tolerance=tolerance), source.factors()
+def _golden(observer: Observer, source: Source, track: str | None) -> dict[str, Any]:
+    """Return the literals of golden vectors in the units of the recordings, and their tolerance."""
+    tolerance, factors = TOLERANCE[source.precision.type], source.factors()
+    golden = Golden.of(observer, track, tolerance=tolerance)
     y, u, x = (
         np.array([factors[n] for n in names]) for names in (observer.outputs, observer.inputs, observer.recorded)
     )
-    return {
+    literals = {
         "y": [[_sample(v) for v in row] for row in golden.y / y],
         "u": [[_sample(v) for v in row] for row in golden.u / u],
         "x": [[f"{v:.17g}" for v in row] for row in golden.x_hat / x],
@@ -123,6 +111,7 @@ def _golden(observer: Observer, source: Source, track: str | None, tolerance: fl
             for v in np.maximum(np.abs(golden.x_hat).max(axis=0), np.finfo(float).tiny) / np.abs(x)
         ],
     }
+    return {"golden": literals, "tolerance": tolerance}
 
 
 def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
@@ -163,9 +152,6 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     return -(-(8 * doubles + real * reals + 4 * words) // align) * align
 
 
-Array = npt.NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False)
 class Golden:
     """Samples and what becomes of them."""
@@ -173,11 +159,11 @@ class Golden:
     y: Array  # (n_samples, q)
     u: Array  # (n_samples, m)
     x_hat: Array  # (n_samples, n_recorded)
-    status: npt.NDArray[Any]  # (n_samples,)
+    status: AnyArray  # (n_samples,)
     passes: int
-    last_status: npt.NDArray[Any]  # (n_samples,)
+    last_status: AnyArray  # (n_samples,)
     # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
-    sure: npt.NDArray[Any]
+    sure: AnyArray
 
     @classmethod
     def of(cls, observer: Observer, track: str | None = None, count: int = 60, tolerance: float = 0.0) -> Golden:

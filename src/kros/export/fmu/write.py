@@ -23,7 +23,7 @@ from ...observer.units import recorded_channel
 from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
 from ..c99.write import c_files
-from ..text import plain, rendered, require_identifier
+from ..text import plain, rendered
 
 log = logging.getLogger(__name__)
 _KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
@@ -79,15 +79,15 @@ def export_fmu(
     True
     """
     out = Path(out)
-    require_identifier(name)
     if fmi not in (2, 3):
         raise ConfigError(f"Export of an FMU: fmi should be 2 or 3, found {fmi!r}.")
     if out.suffix != ".fmu" or out.exists():
         raise ConfigError(f"Export of an FMU: {out} should be a new file that ends in .fmu.")
-    files = c_files(observer, name, precision, track)
+    source = Source.of(observer, name, precision, track)
+    files = c_files(observer, source)
     sources = {f"sources/{file}": files[file] for file in (f"{name}.h", f"{name}.c")}
     guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
-    texts = fmu_files(Source.of(observer, name, precision, track), fmi, guid)
+    texts = fmu_files(source, fmi, guid)
     every = {**texts, **sources, "documentation/README.md": files["README.md"]}
     packed = {file: text.encode() for file, text in every.items()}
     write_bytes(out, _archive(packed | compiled(packed, name, fmi)))

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...lifting import Lifting
-from ...loops import Library, formulas, library, tape_of
+from ...loops import Library, formulas, library
 from .segments import Segments
 
 Array = npt.NDArray[np.float64]
@@ -104,7 +104,6 @@ class _Run:
         (n, p, batch), lifting, h, m = self.W.shape, self.lifting, self.lifting.history, self.u.shape[1]
         per_unit, total = batch // self.units, (len(self.x) - 1 - h) // self.stride
         entries = (*range(n), *(entry for entry, _, _ in past))
-        tape = tape_of(lifting, m, entries)
         job = {
             "samples": len(self.x),
             "batch": batch,
@@ -113,14 +112,12 @@ class _Run:
             "stride": self.stride,
             "terms": len(entries),
             "depth": len(S),
-            "slopes": len(tape.slopes),
             "term": [*((state, 0) for state in range(n)), *((state, delay) for _, state, delay in past)],
-            "slope": tape.slopes,
             "window": window,
             "S": S,
         }
         job |= {name: getattr(self, name) for name in ("W", "T", "x", "u", "valid", "sigma")}
-        of_lifting = formulas(lifting, tape, self.parameters, m, batch)
+        of_lifting = formulas(lifting, self.parameters, m, batch, entries)
         together = max(1, _AT_ONCE // (batch * n * (n * p + 1)))
         for start in range(0, total, together):
             count, first = min(together, total - start), h + start * self.stride
@@ -135,7 +132,7 @@ class _Run:
         psi[:n] = window[:n]
         for k in range(h, len(self.x) - 1):
             u = self.u[k]
-            lifting.lift_into(psi[:nl].T, self.parameters, window[n:].T)
+            psi[:nl] = lifting.lift(window.T, self.parameters).T
             psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
             terms = np.stack([*recent[0], *(recent[delay][state] for _, state, delay in past)])
             following = np.einsum("abj,bqj->aqj", self._state_matrix(window, u, past), terms)

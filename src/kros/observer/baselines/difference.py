@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Parameters
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -24,44 +23,47 @@ class FilteredDifference:
     sample_period_s: float
     scales: tuple[float, ...] = ()  # of every pair: the state over the rate, which units of measure decide; one
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate the rates from y (n_samples, batch, q), from rest; (n_samples, batch, n), NaN for other states."""
-        from scipy.signal import butter, lfilter
-
         del u, parameters
-        y, estimate = hold_missing(y), np.full((*y.shape[:2], self.n_states), np.nan)
-        low_pass = butter(2, self.cutoff_hz, fs=1 / self.sample_period_s)
-        for number, (measurement, state) in enumerate(self.pairs):
-            rate = np.zeros(y.shape[1::-1])
-            rate[:, 2:] = np.diff(y[:-1, :, measurement].T, axis=1) / self.sample_period_s
-            estimate[..., state] = (self.scales[number] if self.scales else 1.0) * lfilter(*low_pass, rate).T
+        estimate, found = np.full((*y.shape[:2], self.n_states), np.nan), rates(y, self.cutoff_hz, self.sample_period_s)
+        for (measurement, state), scale in zip(self.pairs, self.scales or [1.0] * len(self.pairs), strict=True):
+            estimate[..., state] = scale * found[..., measurement]
         return estimate
 
     def scaled_to(self, batch: EpisodeBatch, measured: Sequence[int]) -> FilteredDifference:
         """Return the same with the scales that fit recordings best, so that units of measure do not matter."""
         y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
-        rates, states = replace(self, scales=()).run(y, y[..., :0])[inside], batch.states[inside]
-        power, along = (rates**2).sum(axis=0), (rates * states).sum(axis=0)
-        return replace(self, scales=tuple(float(along[i] / power[i]) if power[i] else 1.0 for _, i in self.pairs))
+        found, states = rates(y, self.cutoff_hz, self.sample_period_s)[inside], batch.states[inside]
+        both = [(found[:, i], states[:, j]) for i, j in self.pairs]
+        return replace(self, scales=tuple(float(r @ x / (r @ r)) if r.any() else 1.0 for r, x in both))
+
+
+def rates(y: Array, cutoff_hz: float, sample_period_s: float) -> Array:
+    """Return the low-passed rates of measurements, (n_samples, batch, q), from rest."""
+    from scipy.signal import butter, lfilter
+
+    y, rate = hold_missing(y), np.zeros(y.shape)
+    rate[2:] = np.diff(y[:-1], axis=0) / sample_period_s
+    return lfilter(*butter(2, cutoff_hz, fs=1 / sample_period_s), rate, axis=0)
 
 
 def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:
     """Return which states are rates of measured ones: these explain a share of their variance, whatever the units."""
     y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
-    states, n, dt = batch.states[inside], batch.states.shape[-1], batch.sample_period_s
-    hidden = [j for j in range(n) if j not in measured]
-    share = np.zeros((len(measured), n))
-    for i in range(len(measured)):
-        for cutoff in cutoffs_hz(dt)[::4]:
-            rates = FilteredDifference(n, tuple((i, j) for j in hidden), float(cutoff), dt).run(y, y[..., :0])[inside]
-            share[i] = np.maximum(share[i], [_explained(*pair) for pair in zip(rates.T, states.T, strict=True)])
+    states, dt = batch.states[inside].T, batch.sample_period_s
+    share = np.zeros((len(measured), len(states)))
+    for cutoff in cutoffs_hz(dt)[::4]:
+        pairs = product(rates(y, cutoff, dt)[inside].T, states)
+        share = np.maximum(share, np.reshape([_explained(*pair) for pair in pairs], share.shape))
+    share[:, list(measured)] = 0.0
     best = [(i, int(j)) for i, j in enumerate(share.argmax(axis=1)) if share[i, j] > explained]
     return tuple((i, j) for i, j in best if share[:, j].argmax() == i)
 
 
 def _explained(rate: Array, state: Array) -> float:
-    """Return the share of a state's variance that a rate of the same sign explains, zero for what is not estimated."""
-    if np.isnan(rate).any() or not np.ptp(rate) or not np.ptp(state):
+    """Return the share of a state's variance that a rate of the same sign explains."""
+    if not np.ptp(rate) or not np.ptp(state):
         return 0.0
     return max(float(np.corrcoef(rate, state)[0, 1]), 0.0) ** 2
 

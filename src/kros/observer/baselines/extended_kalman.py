@@ -20,13 +20,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Parameters
 from ...core.errors import DimensionError
 from ...lifting import Lifting
-from ..screen import require_samples
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,21 +34,19 @@ class ExtendedKalman:
     A: Array  # (n_lifted, n_lifted)
     B: Array  # (n_lifted, m), with input functions
     measured: tuple[int, ...]
-    inputs: tuple[str, ...]
     Q: Array  # (n, n), process noise of the original states; or (k, n, n) for k filters at once
     R: Array  # (q, q), measurement noise
     P0: Array  # (n, n), of the first estimate
     parameters: Mapping[str, float] = field(default_factory=dict)
     delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Predict a batch from y (n_samples, batch, q), NaN where missing, and u, shape (n_samples, batch, n)."""
         return self.run_all(y, u, parameters)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def run_all(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run_all(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
-        require_samples("the extended Kalman filter", len(self.measured), self.inputs, y, u)
         lifting, n, C, (n_samples, batch) = self.lifting, self.lifting.n_states, list(self.measured), y.shape[:2]
         values = {**self.parameters, **(parameters or {})}
         if self.delay:
@@ -73,12 +68,10 @@ class ExtendedKalman:
             earlier = lifting.window.advance(window, u[sample])
         return np.moveaxis(estimates, 0, 1)
 
-    def _ahead(self, window: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
+    def _ahead(self, window: Array, u: Array, values: Parameters) -> Array:
         """Return the next states by the model."""
         n, lifting = self.lifting.n_states, self.lifting
-        return np.asarray(
-            lifting.lift(window, values) @ self.A[:n].T + lifting.lift_inputs(u, window, values) @ self.B[:n].T
-        )
+        return lifting.lift(window, values) @ self.A[:n].T + lifting.lift_inputs(u, window, values) @ self.B[:n].T
 
     def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
         """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""
@@ -88,7 +81,7 @@ class ExtendedKalman:
         L, nu = np.where(lost[..., None], 0.0, PC @ np.linalg.inv(S)), np.where(lost, 0.0, nu)
         return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
-    def _late(self, y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
+    def _late(self, y: Array, u: Array, values: Parameters) -> Array:
         """Run on what was measured, and predict each estimate to the row in which it is there."""
         d = min(self.delay, len(y) - 1)
         if self.lifting.history:

@@ -11,18 +11,16 @@ equal.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Parameters, Whole
 from ...core.errors import DataError
 from ...core.rounding import TINY
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class Learned:
     constant: Array  # (h,)
     weights: Array  # (delays, q + m, h): the latest sample first
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n)."""
         from scipy.signal import oaconvolve
 
@@ -104,7 +102,7 @@ class Moments:
         return Learned(self.measured, self.estimated, weights[0], by_delay)
 
 
-def regressors(z: Array, at: npt.NDArray[np.int64], delays: int) -> Array:
+def regressors(z: Array, at: Whole, delays: int) -> Array:
     """Return [1, z_{k-1}, z_{k-2} - z_{k-1}, ...] for samples k, shape (len(at), 1 + d channels)."""
     padded = np.concatenate([np.repeat(z[:1], delays, axis=0), z[:-1]])
     past = padded[at[:, None] + np.arange(delays - 1, -1, -1)]

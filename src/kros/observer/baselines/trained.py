@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from ...core.arrays import Array, Parameters
 from ...core.errors import DataError
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 
-Array = npt.NDArray[np.float64]
 Regressor = Literal["boosting", "network"]
 
 
@@ -48,7 +48,7 @@ class Trained:
     features: Features
     regressors: Sequence[Any]
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n)."""
         del parameters
         estimate = np.full((*y.shape[:-1], self.n_states), np.nan)

@@ -15,15 +15,14 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.artifacts import Storable
+from ...lifting.intervals import Box
 from ..data import ObserverData
 from ..units import factors
-from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
+from .error import ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
 from .proof import first_proof, frozen_gain, growing_place
-
-Array = npt.NDArray[np.float64]
 
 
 class ReliftStatus(str, Enum):
@@ -115,9 +114,9 @@ class ReliftCertificate(Storable):
         """Return the error dynamics that the certificate is about."""
         return error_system(observer, self.scales, self.box, self.parameters)
 
-    def in_sizes(self, observer: ObserverData, sizes: Mapping[str, float]) -> ReliftCertificate:
-        """Return what the certificate of an observer says of the same observer for signals divided by other sizes."""
-        x, u = factors(observer, sizes)
+    def in_units(self, observer: ObserverData) -> ReliftCertificate:
+        """Return what the certificate of an observer says of the same observer in the units of the recordings."""
+        x, u = factors(observer, {})
         n, lifting = observer.lifting.n_states, observer.lifting
         names = (*lifting.states, *observer.inputs)
         by_name = dict(zip(names, np.concatenate([x[:n], u[: len(observer.inputs)]]), strict=True))
@@ -206,10 +205,11 @@ def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None
         found.append(f"true and estimated state stay within {_ranges(box)}")
     found.append("every measurement arrives")
     limits, names = observer.runtime, observer.lifting.states
+    limited = np.isfinite(limits.sides(len(names))).any(axis=0)
     if limits.delay:
         found.append(f"measurements arrive {limits.delay} samples late")
-    if clips := limits.limited_states(len(names)):
-        found.append(f"the true {', '.join(names[i] for i in clips)} stays within the limits of the estimate")
+    if clips := [names[i] for i in np.flatnonzero(limited)]:
+        found.append(f"the true {', '.join(clips)} stays within the limits of the estimate")
     if observer.seen is not None:
         found.append("no measurement and no input is refused as implausible")
     return tuple(found)

@@ -22,23 +22,20 @@ d_k       : position of every slope in its interval
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ...core.errors import DimensionError, KrosError
-from ...core.linalg import floats
+from ...core.arrays import Array, ArrayLike
+from ...core.errors import DataError, DimensionError, KrosError
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ROUNDING
 from ...lifting.formula import delayed_name
-from ...lifting.intervals import break_of, slope_bounds_of
+from ...lifting.intervals import Box, break_of, slope_bounds_of
+from ..checked import floats
 from ..data import ObserverData
 
-Array = npt.NDArray[np.float64]
-Box = Mapping[str, Any]
 _WIDER = 1 + 4 * EPS  # centre and half width are rounded
 _CONSTANT = 4 * ROUNDING  # interval bounds are widened by so much: a slope within that is constant
 
@@ -75,16 +72,13 @@ class ReliftScales:
     noise: Array
 
     def __post_init__(self) -> None:
-        floats(self, "error", "residual", "noise")
-        counted, others = np.isfinite(self.error), np.append(self.residual, self.noise)
-        if not (np.all(self.error > 0) and counted.any() and np.isfinite(others).all() and np.all(others >= 0)):
-            raise DimensionError(
-                "Re-lift scales: errors should be finite sizes above zero, some of them infinite, residuals and noise "
-                f"finite and not negative, found {self}."
-            )
+        others = dict.fromkeys(("residual", "noise"), "finite and not negative")
+        floats(self, "Re-lift scales", error="positive", **others)
+        if not np.isfinite(self.error).any():
+            raise DataError(f"Re-lift scales: one of the errors at least should be finite, found {self.error}.")
 
     @classmethod
-    def typical(cls, ranges: npt.ArrayLike, residual: Array, noise: npt.ArrayLike) -> ReliftScales:
+    def typical(cls, ranges: ArrayLike, residual: Array, noise: ArrayLike) -> ReliftScales:
         """Return the scales for which a population's residual has unit power: the gain is then a typical error.
 
         Of ranges, shape (n,), one-step residuals of the population, shape (..., n), and the standard deviation of every
@@ -116,16 +110,6 @@ class ErrorSystem:
     E: Array | float = 0.0  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
     start: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n_xi, n_window): where the first error goes
 
-    def closed(self, d: npt.ArrayLike) -> Array:
-        """Return ``(I - diag(d) E)^-1 diag(d)``, shape (n_p, n_p)."""
-        d = np.asarray(d, dtype=float)
-        return np.asarray(np.linalg.solve(np.eye(len(d)) - d[:, None] * self.E, np.diag(d)))
-
-    def corner(self, d: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return ``A + L d M`` and ``B + L d D``, d (n_p,) a place in the box."""
-        moved = self.L @ self.closed(d)
-        return self.A + moved @ self.M, self.B + moved @ self.D
-
     def multiplied(self, multipliers: Array, gain: float) -> tuple[tuple[Array, Array], Array, Array]:
         """Return (A, B), C and D with p as input and q as output: a gain proven for it holds in the whole box."""
         root = np.sqrt(multipliers)
@@ -136,9 +120,11 @@ class ErrorSystem:
         D[: len(root), len(root) :] = _WIDER * root[:, None] * self.D
         return (self.A, B), C, D
 
-    def frozen(self, d: npt.ArrayLike) -> StateSpace:
-        """Return the system from w to z with slopes that stay where they are."""
-        A, B = self.corner(d)
+    def frozen(self, d: ArrayLike) -> StateSpace:
+        """Return the system from w to z with slopes that stay at a place d in the box, (n_p,)."""
+        d = np.asarray(d, dtype=float)
+        moved = self.L @ np.linalg.solve(np.eye(len(d)) - d[:, None] * self.E, np.diag(d))
+        A, B = self.A + moved @ self.M, self.B + moved @ self.D
         return StateSpace(A, B, self.C, np.zeros((len(self.C), B.shape[1])), self.dt)
 
     def mismatch(self) -> ErrorSystem:
@@ -188,7 +174,7 @@ class _Assembly:
         self.q_rows = np.zeros((self.sizes[1], sum(self.sizes)))
         self.channels = [""] * self.sizes[1]
 
-    def rows(self, where: int, first: int, count: int, scale: npt.ArrayLike = 1.0) -> Array:
+    def rows(self, where: int, first: int, count: int, scale: ArrayLike = 1.0) -> Array:
         """Return some entries of xi (0), p (1) or w (2)."""
         rows = np.zeros((count, sum(self.sizes)))
         rows[range(count), sum(self.sizes[:where]) + first + np.arange(count)] = scale

@@ -26,19 +26,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array
 from ...core.lti import StateSpace
 from ...core.norms import first_frequencies, gramian, hinf_norm, to_continuous
 from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 from .error import ErrorSystem
-
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[Any]
-Integers = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -124,7 +119,7 @@ def proposals(system: ErrorSystem) -> Iterator[Proof]:
             yield Proof(least * factor, R, multipliers * factor)
 
 
-def best_multipliers(H: Complex, width: int) -> Array | None:
+def best_multipliers(H: AnyArray, width: int) -> Array | None:
     """Return multipliers, (n_p,), of nearly the least gain for responses (f, ., .); None where none prove stability."""
     from scipy.optimize import linprog
 
@@ -145,7 +140,7 @@ def best_multipliers(H: Complex, width: int) -> Array | None:
     return None if best is None else best * unit
 
 
-def _scaled(H: Complex, width: int) -> tuple[Array, Complex]:
+def _scaled(H: AnyArray, width: int) -> tuple[Array, AnyArray]:
     """Return units of the multipliers, and responses in which these and the squared gain are of size one."""
     through = np.sqrt(np.max(np.sum(np.abs(H[:, width:, :width]) ** 2, axis=1), axis=0))
     by_slopes = through @ np.sqrt(np.max(np.sum(np.abs(H[:, :width, width:]) ** 2, axis=2), axis=0))
@@ -156,7 +151,7 @@ def _scaled(H: Complex, width: int) -> tuple[Array, Complex]:
     return through**2, H
 
 
-def _cuts(H: Complex, t: Array, g: float) -> Array:
+def _cuts(H: AnyArray, t: Array, g: float) -> Array:
     """Return rows (c, n_p + 2) of ``v' F_f(t, g) v = a t + b g - c`` for the eigenvectors of least value."""
     width = len(t)
     F = np.diag(np.append(t, np.full(H.shape[2] - width, g))) - _forms(H, t)
@@ -170,13 +165,13 @@ def _cuts(H: Complex, t: Array, g: float) -> Array:
     )
 
 
-def _forms(H: Complex, t: Array) -> Complex:
+def _forms(H: AnyArray, t: Array) -> AnyArray:
     """Return ``sum_j t_j h_fj' h_fj + H_z' H_z`` at every frequency."""
     weight = np.append(t, np.ones(H.shape[1] - len(t)))
     return np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
 
 
-def gain_squared(H: Complex, t: Array) -> float:
+def gain_squared(H: AnyArray, t: Array) -> float:
     """Return the least g that multipliers allow on the grid, by a Schur complement, or infinity."""
     width = len(t)
     F = _forms(H, t)
@@ -187,7 +182,7 @@ def gain_squared(H: Complex, t: Array) -> float:
     return float(np.linalg.eigvalsh(schur)[:, -1].max())
 
 
-def _responses(system: ErrorSystem) -> Complex:
+def _responses(system: ErrorSystem) -> AnyArray:
     """H at the frequencies at which `hinf_norm` begins; shape (f, n_p + n_z, n_p + n_w)."""
     C, D = np.vstack([system.M, system.C]), np.hstack([np.broadcast_to(system.E, 2 * (system.L.shape[1],)), system.D])
     D = np.vstack([D, np.zeros((len(system.C), D.shape[1]))])
@@ -242,14 +237,14 @@ def proven(root: Array, inputs: tuple[Array, Array], C: Array, D: Array, gain: f
     return positive(F)
 
 
-def _integers(matrix: Array, shift: int) -> Integers:
+def _integers(matrix: Array, shift: int) -> AnyArray:
     """Return ``2^shift`` times a matrix of doubles, as integers without rounding."""
     mantissa, exponent = np.frexp(matrix)
     whole = (mantissa * 2.0**_DIGITS).astype(np.int64).astype(object)
     return np.asarray(whole << (exponent - _DIGITS + shift).astype(object), dtype=object)
 
 
-def positive(F: Integers) -> bool:
+def positive(F: AnyArray) -> bool:
     """Whether a symmetric matrix of integers is positive definite, by elimination without rounding."""
     n = len(F)
     if any(F[i, i] <= 0 for i in range(n)):

@@ -13,32 +13,31 @@ units bounds the error for every ``sum_i a_i w_i``, ``sum_i |a_i| <= 1``, of the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Flags, Parameters, Whole
 from ...core.rounding import AGREED, TINY
 from ...data import EpisodeBatch
 from ...loops.filtering import recursion
 from ..data import ObserverData
-from ..residual.one_step import one_step_residual
+from ..residual import one_step_residual
 from ..screen import screened
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem, ReliftScales
 from .proof import proven_gain
 
-Array = npt.NDArray[np.float64]
 _OTHERS = (0.0, 1e-3)  # weights of other states' errors: with them the Riccati equation is better conditioned
 
 
 @dataclass(frozen=True, eq=False)
 class SignalBound:
-    """Bounds on the errors of one observer at run time, in the states' own units of measure."""
+    """Bounds on the errors of one observer at run time, in the units of measure of the batch."""
 
     states: tuple[str, ...]  # of the recordings
     units: tuple[str, ...]
@@ -85,11 +84,6 @@ class SignalBound:
             "set_outside": list(self.outside),
         }
 
-    def in_sizes(self, factors: npt.ArrayLike) -> SignalBound:
-        """Return the same for states in other units of measure, by their factors, shape (n,)."""
-        by = np.asarray(factors, dtype=float)
-        return replace(self, **{name: getattr(self, name) * by for name in ("bounds", "errors", "sizes")})
-
 
 def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: EpisodeBatch) -> SignalBound:
     """Bound errors for signals like those of training episodes as their sensor shows them, of which none is lost."""
@@ -114,8 +108,8 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
     gains, moving = mismatch_gains(system, share, n), np.linalg.norm(acted / share, axis=1)[:, None]
     with np.errstate(invalid="ignore"):
         added = np.where(moving > 0, gains * moving, 0.0)
-    bounds, taken = sizes * (1 + AGREED) * (frozen[:, :n] + added) + rms(seen.beyond), seen.taken(observer)
-    outside = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not taken[rows].all())
+    bounds, refused = sizes * (1 + AGREED) * (frozen[:, :n] + added) + rms(seen.beyond), member @ seen.refused
+    outside = tuple(unit for unit, some in zip(units, refused, strict=True) if some)
     bounds[[unit in outside for unit in units]] = np.inf
     reason = "" if np.isfinite(gains).all() else "what slopes can add has no proven gain"
     return replace(result, bounds=bounds, reason=reason, outside=outside)
@@ -125,7 +119,7 @@ def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array,
     """Return the scaled errors and what the slopes act on, (n_samples, batch, .), with slopes in the middle."""
     w = np.concatenate([w, np.zeros((1, *w.shape[1:]))])
     xi = recursion(system.A, w, first @ system.start.T, system.B)
-    return np.asarray(xi @ system.C.T), np.asarray(xi @ system.M.T + w @ system.D.T)
+    return xi @ system.C.T, xi @ system.M.T + w @ system.D.T
 
 
 def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
@@ -149,21 +143,14 @@ class Course:
     noise: Array  # (n_samples - 1, batch, q): what the sensor shows beside the recording, as it arrives
     first: Array  # (batch, n_window): first error, with the earlier ones that the lifting reads, which equal it
     error: Array  # (n_samples, batch, n)
-    lengths: npt.NDArray[np.int64]  # (batch,)
-    inputs: Array  # (n_samples, batch, m)
-    y: Array  # (n_samples, batch, q): measurements as they arrive
+    lengths: Whole  # (batch,)
+    refused: Flags  # (batch,): whether the observer refuses a sample
     beyond: Array  # (n_samples, batch, n_recorded): what recorded states are beyond declared limits, by noise
 
     def mean_square(self, signal: Array) -> Array:
         """Return the mean square of every channel over every episode, shape (batch, k)."""
         inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
         return np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None]
-
-    def taken(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
-        """Whether the observer takes all samples, shape (batch,)."""
-        samples = screened(observer, self.y, self.inputs)
-        good = np.isfinite(samples.y).all(axis=-1) & (samples.u == self.inputs).all(axis=-1)
-        return (good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0)
 
 
 def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
@@ -175,17 +162,17 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     y = batch.states[due][..., at] if batch.shown is None else batch.measurements(at, arrived=False)
     estimates = run_observer(observer, y, inputs, values)
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
-    taken = screened(observer, y, inputs).y
-    noise = np.where(np.isfinite(taken), taken, y)[:-1] - states[due][:-1][..., at]
+    samples = screened(observer, y, inputs)
+    bad = ~np.isfinite(samples.y).all(axis=-1) | (samples.u != inputs).any(axis=-1)
+    refused = (bad & (np.arange(len(bad))[:, None] < batch.lengths)).any(axis=0)
+    noise = np.where(np.isfinite(samples.y), samples.y, y)[:-1] - states[due][:-1][..., at]
     noise[:late] = 0.0
     omega = held_residual(observer, states, inputs, values)
-    first = first_error(observer, states[0] - observer.initial(taken[0], values))
-    return Course(omega, noise, first, states - estimates, batch.lengths, inputs, y, batch.states - states)
+    first = first_error(observer, states[0] - observer.initial(samples.y[0], values))
+    return Course(omega, noise, first, states - estimates, batch.lengths, refused, batch.states - states)
 
 
-def held_residual(
-    observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike]
-) -> Array:
+def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Parameters) -> Array:
     """Return the one-step residual, shape (n_samples - 1, batch, n); values before the first sample equal it."""
     h = observer.lifting.history
     if h:

@@ -101,7 +101,7 @@ def identify_estimator(
     trial = observer_of(*(reduced(r.without(group), len(f.A)) for f, r in smaller))
     assert observer.bank is not None
     bank = with_gaps(observer.bank, trial, unseen, settings, held)
-    observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings.room))
+    observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings))
     states = lifting.states
 
     def by_state(values: Array) -> dict[str, float]:
@@ -133,12 +133,19 @@ def require_known(unbounded: Mapping[str, Sequence[str]], measured: Sequence[str
         )
 
 
-def bounded(observer: Observer, recordings: Recordings, room: float) -> Runtime:
-    """Return limits of the estimates of hidden states: their ranges in training, widened by a share."""
+def bounded(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> Runtime:
+    """Return limits of the estimates: ranges of hidden states in training, widened by a share, or those declared."""
     low, high = recordings.ranges
+    room, states = settings.room, observer.lifting.states
     lower, upper = (np.full(observer.lifting.n_states, end) for end in (-np.inf, np.inf))
     hidden = [i for i in range(len(recordings.size)) if i not in observer.measured]
     lower[hidden], upper[hidden] = (low - room * (high - low))[hidden], (high + room * (high - low))[hidden]
+    for name, ends in settings.limits.items():
+        if name not in observer.recorded:
+            known = ", ".join(observer.recorded)
+            raise ConfigError(f"Estimator: limits should be of the states {known}, found {name!r}; correct the name.")
+        i, size = states.index(name), observer.lifting.sizes_of([name])[0]
+        lower[i], upper[i] = max(lower[i], ends[0] / size), min(upper[i], ends[1] / size)
     return Runtime(0, lower, upper)
 
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from ...core.arrays import Parameters
 from ...core.rounding import TINY
 from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
 from ..simulate import Course
-from ..step import Parameters
 from .regression import Recordings, is_less
 from .settings import EstimatorSettings
 

@@ -80,6 +80,10 @@ class EstimatorSettings(Settings):
         ge=0,
         description="share of its range in training by which a hidden state may leave it; it is cut off there",
     )
+    limits: dict[str, tuple[float, float]] = Field(
+        {},
+        description="least and largest value that a state can have, as the current of a drive; estimates stay inside",
+    )
     reach: float = Field(
         0.25,
         ge=0,

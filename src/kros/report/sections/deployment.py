@@ -8,7 +8,6 @@ from typing import Any
 from ..content import Column, Section, Table, build
 from ..facts import Facts
 from ..names import axis_label, joined, number, observer_about, words
-from .evidence import limit_text
 
 _ERRORS = {
     "noise": "white noise, standard deviation",
@@ -51,7 +50,7 @@ def _needed(facts: Facts, entry: Mapping[str, Any]) -> Table | None:
 
 
 def _interface(facts: Facts, entry: Mapping[str, Any]) -> list[tuple[str, Sequence[str]]]:
-    """Return signals, rate, delay, parameters, limits and sensor."""
+    """Return signals, rate, delay, parameters and sensor."""
     largest, dt, late = entry["largest"], facts.study["sample_period_s"], entry["delay_samples"]
 
     def named(names: Sequence[str]) -> str:
@@ -60,13 +59,11 @@ def _interface(facts: Facts, entry: Mapping[str, Any]) -> list[tuple[str, Sequen
 
     hidden = [axis_label(n, facts.unit(n)) for n in entry["estimates"] if n not in entry["measured"]]
     delay = f"a measurement delay of {late} samples is assumed" if late else "no measurement delay is assumed"
-    limits = [f"{words(c)}: {limit_text(limit)}." for c, limit in facts.study.get("limits", {}).items()]
     return [
         ("Reads", [f"Measured: {named(entry['measured'])}. Inputs: {named(entry['inputs'])}."]),
         ("Estimates", [f"{joined(hidden)}, for the next sample; {delay}."]),
         ("Rate", [f"One step every {dt:g} s ({1 / dt:g} Hz), {entry['states']} states."]),
         ("Parameters", _parameters(entry["parameters"], facts.get("calibration") is not None)),
-        ("Limits", limits),
         ("Sensor", _sensor(facts, entry["sensor"])),
     ]
 

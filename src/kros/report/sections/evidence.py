@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Mapping
 from importlib import import_module
-from typing import Any
 
 from ...core.linalg import radius_text
 from ...data.recording import some
@@ -38,19 +36,8 @@ def recordings(facts: Facts) -> Section:
         Column("role", [roles.get(c, "estimated") for c in channels]),
         Column("resolution", [study.get("resolution", {}).get(c) for c in channels]),
         Column("declared sensor", declared),
-        Column("limits", [limit_text(study.get("limits", {}).get(c)) for c in channels]),
     ]
     return Section("recordings", "Recordings", [text], tables=[build("Channels", columns)], figure="signals")
-
-
-def limit_text(limit: Mapping[str, Any] | None) -> str:
-    """Return a limit and where units were seen at it."""
-    if limit is None:
-        return ""
-    sides = {"lower": "at least", "upper": "at most"}
-    ends = ", ".join(f"{text} {number(limit[side])}" for side, text in sides.items() if limit[side] is not None)
-    seen = (limit.get("seen") or {}).get("units")
-    return f"{ends}, from the recordings of {some(seen, 3)}" if seen else f"{ends}, from the recordings"
 
 
 def calibration(facts: Facts) -> Section | None:

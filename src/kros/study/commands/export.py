@@ -63,7 +63,7 @@ def export_run(
             chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track), ""
-        level = angle_load(RecordingFacts.load(store.path("population")).limits, chosen.sample_period_s)
+        level = angle_load(config.estimator, chosen.sample_period_s)
         load = LoadOutput(level, current=TRIAL.current) if observer in loads else None
         folder = export_c(chosen, out, name, precision, track, load)
         write_json(folder / "study.json", config.dump())

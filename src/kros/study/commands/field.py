@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.arrays import Bits
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import read_toml
@@ -29,7 +30,7 @@ from ...identify import PhaseCalibration
 from ...identify.calibration import segments_of
 from ...identify.survey import RecordingFacts
 from ...observer import Observer
-from ...observer.screen import Bits, SampleStatus
+from ...observer.screen import SampleStatus
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ...observer.units import recorded_channel, recorded_factors

@@ -21,7 +21,6 @@ from ...evaluate.held_out import HeldOut, Outcome, alike
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
 from ...observer.baselines.trained import Regressor
-from ...observer.sensor import sides
 from ..engine.context import Context
 from .load import run_load
 
@@ -65,17 +64,17 @@ def run(context: Context) -> None:
 
 def estimation(context: Context, episodes: HeldOut) -> Pieces:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
-    limits, makers = sides(context.facts.limits, context.population.states), baseline_makers(context, episodes)
-    work: Pieces = {(name,): partial(of_baseline, episodes, make, limits) for name, make in makers.items()}
+    makers = baseline_makers(context, episodes)
+    work: Pieces = {(name,): partial(of_baseline, episodes, make) for name, make in makers.items()}
     for group in alike(load_observers(context).values()):
         work[tuple(observer.name for observer in group)] = partial(episodes.observers, group)
     return work
 
 
-def of_baseline(episodes: HeldOut, make: Callable[[], Baseline], limits: tuple[Array, Array]) -> Outcome | str:
+def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome | str:
     """Make a baseline and run it; return the reason where it cannot be made."""
     try:
-        baseline = replace(make(), limits=limits)
+        baseline = make()
     except KrosError as error:
         return str(error)
 

@@ -17,7 +17,7 @@ from ...identify.identified import IdentifiedModels
 from ...identify.identify import with_models
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...identify.survey import Copy, check_usable, survey
-from ...observer.residual.one_step import FEWEST_SAMPLES
+from ...observer.residual import FEWEST_SAMPLES
 from ...observer.sensor import require_measured
 from ...uncertainty.quantify import quantify
 from ..config import Stage, StudyConfig

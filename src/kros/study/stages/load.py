@@ -21,12 +21,11 @@ from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
-from ...identify.flat_tops import FoundLimit
 from ...lifting import Lifting
 from ...motor_drive import AngleLoad
 from ...motor_drive.observer import LoadSettings, load_observer
 from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
-from ...observer import Observer, run_observer
+from ...observer import EstimatorSettings, Observer, run_observer
 from ..engine.context import Context
 
 log = logging.getLogger(__name__)
@@ -88,7 +87,7 @@ def load_metrics(context: Context) -> dict[str, Any]:
 def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, dict[str, Any]]:
     """Return the load of an observer that has it as a state, with its level, and facts; save the observer."""
     (angle, current), test, inputs = trial.places, trial.test, context.population.inputs
-    leveled = angle_load(context.facts.limits, trial.dt)
+    leveled = angle_load(context.config.estimator, trial.dt)
     read = LoadSettings(current, leveled.level_s, TRIAL.corner_hz, leveled.limit)
     observer, left_out = load_observer(
         f"{kind}/{LOAD}", lifting, trial.measured, inputs, trial.train, trial.truth[0], read
@@ -101,11 +100,10 @@ def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) 
     return load, {"order": observer.internal, "episodes_left_out": len(left_out)}
 
 
-def angle_load(limits: Mapping[str, FoundLimit], dt: float) -> AngleLoad:
-    """Return what fills in the level of a load; the current's limit is that of the recordings."""
-    reached = limits.get(TRIAL.current)
-    ends = [abs(end) for end in (reached.lower, reached.upper) if end is not None] if reached else []
-    return AngleLoad(LoadSettings.level_s, dt, limit=max(ends, default=np.inf))
+def angle_load(declared: EstimatorSettings, dt: float) -> AngleLoad:
+    """Return what fills in the level of a load, up to the limit of the current."""
+    ends = declared.limits.get(TRIAL.current, (np.inf,))
+    return AngleLoad(LoadSettings.level_s, dt, limit=max(map(abs, ends)))
 
 
 def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, dict[str, Any]]:

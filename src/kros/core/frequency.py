@@ -9,12 +9,10 @@ tau : tan^2(theta / 2), zero at DC and infinite at Nyquist; equals -w^2 on the u
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import Array, ArrayLike
 from .errors import ConfigError
 from .rounding import ROUNDING
-
-Array = npt.NDArray[np.float64]
 
 
 def nyquist_hz(sample_period_s: float) -> float:
@@ -38,7 +36,7 @@ def log_grid(
     return grid
 
 
-def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
+def check_grid(freqs_hz: ArrayLike, sample_period_s: float | None) -> Array:
     """Return the frequencies as an array, or say why they are no grid; without a sampling period of continuous time."""
     freqs = np.atleast_1d(np.asarray(freqs_hz, dtype=float))
     top = np.inf if sample_period_s is None else nyquist_hz(sample_period_s)
@@ -54,7 +52,7 @@ def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
     return freqs
 
 
-def bilinear_squared(freqs_hz: npt.ArrayLike, sample_period_s: float) -> Array:
+def bilinear_squared(freqs_hz: ArrayLike, sample_period_s: float) -> Array:
     """Return tau = tan^2(theta / 2); infinity at Nyquist, and full relative precision near DC."""
     freqs = np.asarray(freqs_hz, dtype=float)
     half = np.pi * freqs * sample_period_s

@@ -5,15 +5,12 @@ Many small matrices have their axes first, `(row, column, ...)`: LAPACK takes st
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from .arrays import AnyArray, Array, ArrayLike
 
 
-def adjoint(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def adjoint(matrices: AnyArray) -> AnyArray:
     """Return the Hermitian transposes of matrices, shape (..., n, m)."""
     return np.asarray(np.conj(np.swapaxes(matrices, -1, -2)))
 
@@ -38,9 +35,7 @@ def balanced_size(A: Array) -> Array:
     return np.asarray(matrix_balance(A, permute=False, separate=True)[1][0]) if A.size else np.ones(len(A))
 
 
-def balancing(
-    R: npt.NDArray[Any], S: npt.NDArray[Any], negligible: float = 0.0
-) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
+def balancing(R: AnyArray, S: AnyArray, negligible: float = 0.0) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Balance the Gramians ``R R'`` and ``S S'``: left, right, ``left @ right = I``, and the Hankel singular values.
 
     The balanced state is ``left x``. Values below a share of the largest are `negligible`.
@@ -51,22 +46,22 @@ def balancing(
     return (U[:, :k] / root).T @ S.T, R @ Vh[:k].T / root, values[:k]
 
 
-def entries_first(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def entries_first(matrices: AnyArray) -> AnyArray:
     """Move the matrix axes to the front: (..., p, m) to (p, m, ...), contiguous."""
     return np.ascontiguousarray(np.moveaxis(matrices, (-2, -1), (0, 1)))
 
 
-def multiply(left: npt.NDArray[Any], right: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
     """Multiply entries-first matrices: (p, r, ...) times (r, m, ...), broadcast over the rest."""
     return np.asarray(np.einsum("ik...,kj...->ij...", left, right))
 
 
-def squared(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def squared(values: AnyArray) -> AnyArray:
     """Return the squared modulus."""
     return values.real**2 + values.imag**2 if np.iscomplexobj(values) else values**2
 
 
-def sigma_max(matrices: npt.ArrayLike) -> npt.NDArray[Any]:
+def sigma_max(matrices: ArrayLike) -> AnyArray:
     """Return the largest singular value, shape (...), of matrices of shape (..., p, m).
 
     Examples
@@ -78,7 +73,7 @@ def sigma_max(matrices: npt.ArrayLike) -> npt.NDArray[Any]:
     return sigma_max_first(entries_first(np.asarray(matrices)))
 
 
-def sigma_max_first(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def sigma_max_first(matrices: AnyArray) -> AnyArray:
     """Return the largest singular value of entries-first matrices (p, m, ...), shape (...)."""
     columns = matrices if matrices.shape[1] <= matrices.shape[0] else np.swapaxes(matrices, 0, 1)
     if columns.shape[1] > 2:

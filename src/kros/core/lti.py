@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import AnyArray, ArrayLike
 from .errors import DimensionError
 
-Array = npt.NDArray[Any]
 
-
-def real_array(name: str, values: Any) -> Array:
+def real_array(name: str, values: Any) -> AnyArray:
     """Return a matrix of doubles, or say by name what else was found."""
     try:
         if np.iscomplexobj(values):
@@ -65,10 +63,10 @@ class StateSpace:
     1.0
     """
 
-    A: Array
-    B: Array
-    C: Array
-    D: Array
+    A: AnyArray
+    B: AnyArray
+    C: AnyArray
+    D: AnyArray
     dt: float
 
     def __post_init__(self) -> None:
@@ -119,11 +117,11 @@ class StateSpace:
         A, B, C, D = (np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in matrices)
         return StateSpace(A, B, C, D, self.dt)
 
-    def poles(self) -> Array:
+    def poles(self) -> AnyArray:
         """Return the eigenvalues of A, shape (..., n)."""
         return np.linalg.eigvals(self.A)
 
-    def spectral_radius(self) -> Array:
+    def spectral_radius(self) -> AnyArray:
         """Return the largest pole magnitude, shape (...); zero without states."""
         return np.abs(self.poles()).max(axis=-1, initial=0.0)
 
@@ -131,12 +129,12 @@ class StateSpace:
         """Return the spectral radius, or the largest real part of a pole in continuous time, of one system."""
         return float(self.spectral_radius() if self.dt > 0 else self.poles().real.max(initial=-np.inf))
 
-    def is_stable(self) -> Array:
+    def is_stable(self) -> AnyArray:
         """Tell whether every pole is inside the unit circle (or the left half-plane)."""
         poles = self.poles()
         return np.all(np.abs(poles) < 1 if self.dt > 0 else poles.real < 0, axis=-1)
 
-    def frequency_response(self, freqs_hz: npt.ArrayLike) -> Array:
+    def frequency_response(self, freqs_hz: ArrayLike) -> AnyArray:
         """Return the transfer matrix on the unit circle (or imaginary axis), shape (..., n_freqs, p, m), complex."""
         s = 2j * np.pi * np.asarray(freqs_hz, dtype=float)
         # zeta = z - 1 keeps full relative precision at low frequency, where z and A are both close to one.
@@ -158,7 +156,7 @@ class StateSpace:
         return StateSpace(A, B, C, self.D @ other.D, self.dt)
 
 
-def gain(matrix: npt.ArrayLike, dt: float) -> StateSpace:
+def gain(matrix: ArrayLike, dt: float) -> StateSpace:
     """Return a static gain as a system without states.
 
     Examples

@@ -20,14 +20,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import AnyArray
 from .errors import DimensionError, KrosError, SynthesisError
 from .linalg import balanced_size, qr_triangle
 from .lti import StateSpace
 from .rounding import AGREED, EPS, ITERATED, TINY
-
-Array = npt.NDArray[Any]
 
 _MAX_ITERATIONS = 60
 _DIGITS, _MOST_DIGITS, _MOST_STATES = 40, 160, 60  # of multiple precision, where double does not suffice
@@ -45,7 +43,7 @@ def as_state_space(system: Any) -> StateSpace:
     return system
 
 
-def gramian(A: Array, B: Array, dt: float) -> Array:
+def gramian(A: AnyArray, B: AnyArray, dt: float) -> AnyArray:
     """Gramian of a stable pair, ``P = A P A' + B B'``, or ``A P + P A' + B B' = 0`` for ``dt = 0``."""
     from scipy.linalg import solve_continuous_lyapunov
 
@@ -55,7 +53,7 @@ def gramian(A: Array, B: Array, dt: float) -> Array:
     return root @ root.T
 
 
-def gramian_root(A: Array, B: Array) -> Array:
+def gramian_root(A: AnyArray, B: AnyArray) -> AnyArray:
     """Return R with ``R R'`` the controllability Gramian of a stable discrete pair, shape (n, at most n).
 
     ``P = sum_k A^k B B' A'^k`` is summed by doubling on its factor, ``R_2k`` is the triangle of
@@ -179,14 +177,14 @@ def to_continuous(system: StateSpace) -> StateSpace:
     return StateSpace(A, np.sqrt(2) * B, np.sqrt(2) * C, system.D - system.C @ B, 0.0)
 
 
-def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
+def _largest(system: StateSpace, nu: AnyArray) -> tuple[float, float]:
     """Return the mapped frequency of the largest gain and that gain."""
     gains = _gains(system, nu)
     best = int(np.argmax(gains))
     return float(nu[best]), float(gains[best])
 
 
-def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
+def _peak(system: StateSpace, nu: AnyArray) -> tuple[float, float]:
     """Return the mapped frequency of the largest gain and that gain, searched for around the largest of those given."""
     from scipy.optimize import minimize_scalar
 
@@ -205,7 +203,7 @@ def _in_hz(system: StateSpace, nu: Any) -> Any:
     return np.arctan(nu) / (np.pi * system.dt) if system.dt > 0 else np.divide(nu, 2 * np.pi)
 
 
-def _gains(system: StateSpace, nu: Array) -> Array:
+def _gains(system: StateSpace, nu: AnyArray) -> AnyArray:
     """Largest singular values at the mapped frequencies `nu` (rad/s for a continuous system)."""
     return np.linalg.norm(system.frequency_response(_in_hz(system, nu)), 2, axis=(-2, -1))
 
@@ -221,7 +219,7 @@ def _rounding(system: StateSpace, nu: float) -> float:
     return float(EPS * np.linalg.norm(inside, 2))
 
 
-def first_frequencies(poles: Array) -> Array:
+def first_frequencies(poles: AnyArray) -> AnyArray:
     """Frequencies for the first lower bound, rad/s: DC, all poles of a continuous system, a grid around them."""
     sizes = np.abs(poles)
     low, high = np.maximum([sizes.min(), sizes.max()], TINY)
@@ -231,7 +229,7 @@ def first_frequencies(poles: Array) -> Array:
     return np.unique(np.concatenate([[0.0], sizes, np.abs(poles.imag), peaks, grid]))
 
 
-def crossings(system: StateSpace, gamma: float) -> Array:
+def crossings(system: StateSpace, gamma: float) -> AnyArray:
     """Frequencies at which a singular value may equal `gamma`, with the points between them."""
     A, B, C, D = system.A, system.B, system.C, system.D
     R = gamma**2 * np.eye(system.n_inputs) - D.T @ D

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Flags, Whole
 from ..core.errors import DataError
 from .population import EpisodeKey, Population
 from .recording import some
@@ -48,13 +47,13 @@ class EpisodeBatch:
     """
 
     keys: tuple[EpisodeKey, ...]
-    lengths: npt.NDArray[np.int64]
+    lengths: Whole
     states: Array
     inputs: Array
     sample_period_s: float
     parameters: dict[str, Array] = field(default_factory=dict)
     shown: Array | None = None
-    lost: npt.NDArray[np.bool_] | None = None
+    lost: Flags | None = None
     truths: Array | None = None
 
     @classmethod
@@ -142,7 +141,7 @@ def hold_missing(y: Array) -> Array:
     return np.take_along_axis(np.where(there, y, 0.0), last, axis=0)
 
 
-def _side_by_side(episodes: Sequence[Array], lengths: npt.NDArray[np.int64]) -> Array:
+def _side_by_side(episodes: Sequence[Array], lengths: Whole) -> Array:
     """Return episodes as one array, shape (n_samples, batch, n_columns), shorter ones held at their last sample."""
     values = np.empty((lengths.max(), len(episodes), episodes[0].shape[1]))
     for i, episode in enumerate(episodes):

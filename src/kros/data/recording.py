@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from ..core import limits
-from ..core.arrays import Array
+from ..core.arrays import Array, Flags, Index
 from ..core.errors import DataError
 from ..core.files import shortened
 from ..core.rounding import AGREED, ROUNDING
@@ -94,7 +93,7 @@ class Recordings:
         return replace(self, places={key: self.places[key] for key in keys})
 
 
-def usable(values: Array) -> npt.NDArray[np.bool_]:
+def usable(values: Array) -> Flags:
     """Tell which samples are numbers of a size that can be computed with."""
     return np.asarray(np.abs(values) <= limits.MAX_VALUE)
 
@@ -238,7 +237,7 @@ class GroupWatch:
         self._channels = channels
         self._resting: list[dict[int, float]] = []
         # of every episode: quantiles (3, n), ranges (n,), the samples that are farthest from the median, and values
-        self._signals: dict[EpisodeKey, tuple[Array, Array, npt.NDArray[np.intp], Array]] = {}
+        self._signals: dict[EpisodeKey, tuple[Array, Array, Index, Array]] = {}
 
     def add(self, key: EpisodeKey, values: Array) -> None:
         """Look at one more episode, all of whose samples are usable."""

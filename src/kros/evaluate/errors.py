@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ..core.arrays import Array, Whole
+
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
 
 
@@ -33,13 +33,13 @@ class ErrorSummary:
         return self.spectra[:, inside].sum(axis=1) * (self.freqs_hz[1] - self.freqs_hz[0])
 
 
-def summarise(estimates: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> list[ErrorSummary]:
+def summarise(estimates: Array, truth: Array, lengths: Whole, dt: float) -> list[ErrorSummary]:
     """Summarise errors of estimates, shape (estimate, n_samples, batch, n or more), against (n_samples, batch, n)."""
     with np.errstate(over="ignore", invalid="ignore"):
         return [_summary(estimate[..., : truth.shape[2]], truth, lengths, dt) for estimate in estimates]
 
 
-def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
+def _summary(estimate: Array, truth: Array, lengths: Whole, dt: float) -> ErrorSummary:
     error = np.ascontiguousarray(np.moveaxis(estimate - truth, 0, -1))  # (batch, n, n_samples)
     spectra = np.empty((len(lengths), _SEGMENT // 2 + 1, error.shape[1]))
     for length in np.unique(lengths):
@@ -51,7 +51,7 @@ def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: 
     return ErrorSummary(rms, _percent(rms, largest(truth, lengths)), spectra, freqs_hz)
 
 
-def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+def error_rms(estimate: Array, truth: Array, lengths: Whole) -> Array:
     """Return the root mean square error of every episode, shape (batch, n); arguments as in `summarise`."""
     with np.errstate(over="ignore", invalid="ignore"):
         error = estimate - truth
@@ -60,7 +60,7 @@ def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> 
         return np.sqrt(np.einsum("kbn,kbn->bn", error, error) / lengths[:, None])
 
 
-def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+def error_percent(estimate: Array, truth: Array, lengths: Whole) -> Array:
     """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n), NaN for a state at zero.
 
     Examples
@@ -74,7 +74,7 @@ def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64])
     return _percent(error_rms(estimate, truth, lengths), largest(truth, lengths))
 
 
-def largest(truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
+def largest(truth: Array, lengths: Whole) -> Array:
     """Return the largest absolute values of episodes, shape (batch, n)."""
     if np.all(lengths == len(truth)):
         return np.maximum(truth.max(axis=0), -truth.min(axis=0))

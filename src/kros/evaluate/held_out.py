@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..identify import ModelSet, free_run
@@ -19,7 +19,6 @@ from .errors import ErrorSummary, summarise
 from .sensor import as_shown
 from .truth import TrueErrors, true_errors
 
-Array = npt.NDArray[np.float64]
 Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
 SIDE_BY_SIDE = 32  # episodes
 _NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again

@@ -9,16 +9,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import DataError
 
-Array = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
 _CELL = ("observer", "condition", "channel")
 
 
-def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[Array, Array]:
+def unit_interval(values: ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[Array, Array]:
     """Return the 95 % percentile bootstrap interval of the mean over units.
 
     Parameters

@@ -15,12 +15,10 @@ from collections.abc import Sequence
 from math import ceil
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import DataError
 from ..core.rounding import ITERATED
-
-Array = npt.NDArray[np.float64]
 
 
 def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]:
@@ -34,7 +32,7 @@ def fewest_units(confidence: float) -> int:
     return ceil(confidence / (1 - confidence) - ITERATED)  # 0.9 / (1 - 0.9) is a little more than 9
 
 
-def next_unit_bound(errors: npt.ArrayLike, scale: npt.ArrayLike, confidence: float = 0.95) -> Array | None:
+def next_unit_bound(errors: ArrayLike, scale: ArrayLike, confidence: float = 0.95) -> Array | None:
     """Bound the errors of the next unit, (k,), all of them together; None with fewer units than `fewest_units`."""
     errors, scale = np.asarray(errors, dtype=float), np.asarray(scale, dtype=float)
     if not (np.isfinite(scale) & (scale > 0)).all():

@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..data import EpisodeBatch, Population
 from ..data.population import EpisodeKey
 from ..observer import Observer
 from ..observer.sensor import Sensor, Sensors
-
-Array = npt.NDArray[np.float64]
 
 
 def as_shown(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str], seed: int = 0) -> EpisodeBatch:
@@ -67,7 +65,7 @@ class Arriving:
     y: Array
     u: Array
 
-    def parameters(self, observer: Observer) -> dict[str, npt.ArrayLike]:
+    def parameters(self, observer: Observer) -> dict[str, ArrayLike]:
         """Return the lifting parameters of all episodes."""
         return observer.own(self.batch.parameters)
 

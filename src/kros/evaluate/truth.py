@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Whole
 from .errors import error_percent, error_rms
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +32,7 @@ class TrueErrors:
         return cls(parts[0].states, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def true_errors(
-    signals: Array, truths: Array, states: tuple[int, ...], lengths: npt.NDArray[np.int64], dt: float
-) -> TrueErrors:
+def true_errors(signals: Array, truths: Array, states: tuple[int, ...], lengths: Whole, dt: float) -> TrueErrors:
     """Return the errors of signals (n_samples, batch, n) against the truths of some states, and how late these are."""
     signals, lag = signals[..., list(states)], np.empty(truths.shape[1:])
     for length in np.unique(lengths):

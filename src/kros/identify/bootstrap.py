@@ -16,16 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, Array
 from ..core.errors import DataError
 from ..core.linalg import qr_triangle
 from .edmd import KoopmanMatrices, edmd
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +33,7 @@ class ModelSamples:
     estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
     samples: KoopmanMatrices  # A (unit, draw, n, n) and B (unit, draw, n, m)
 
-    def responses(self, row: int, freqs_hz: Array, sample_period_s: float) -> npt.NDArray[Any]:
+    def responses(self, row: int, freqs_hz: Array, sample_period_s: float) -> AnyArray:
         """Return frequency responses of one unit's samples, shape (draw, frequency, n, m)."""
         return KoopmanMatrices(self.samples.A[row], self.samples.B[row]).responses(freqs_hz, sample_period_s)
 

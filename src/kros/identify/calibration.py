@@ -23,8 +23,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Flags
 from ..core.artifacts import Storable, digest_of
 from ..core.errors import IdentificationError
 from ..core.rounding import TINY
@@ -33,7 +33,6 @@ from ..data.population import EpisodeKey, Population
 from .survey import RecordingFacts
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 _BLOCK = 100_000  # samples of one recording in memory
 
 
@@ -141,7 +140,7 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
     return segments
 
 
-def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.bool_], dt: float) -> float:
+def _speed_per_reference(angle: Array, reference: Array, steady: Flags, dt: float) -> float:
     """Speed of the angle over the reference: one where their units of measure match, zero where nothing moves."""
     moving = steady[:-1] & steady[1:]
     top = max(float(np.max(np.abs(reference))), TINY)

@@ -15,18 +15,16 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, Array, ArrayLike
 from ..core.errors import IdentificationError
 from ..core.linalg import qr_triangle
 from ..core.lti import StateSpace
 from ..core.rounding import EPS, TINY
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -60,14 +58,14 @@ class KoopmanMatrices:
         """Return the largest eigenvalue magnitude of each A."""
         return np.abs(np.linalg.eigvals(self.A)).max(axis=-1)
 
-    def responses(self, freqs_hz: Array, sample_period_s: float) -> npt.NDArray[Any]:
+    def responses(self, freqs_hz: Array, sample_period_s: float) -> AnyArray:
         """Return frequency responses from inputs to lifted states, shape (..., frequency, n, m)."""
         n, m = self.B.shape[-2:]
         C, D = (np.broadcast_to(M, (*self.A.shape[:-2], *M.shape)) for M in (np.eye(n), np.zeros((n, m))))
         return StateSpace(self.A, self.B, C, D, sample_period_s).frequency_response(freqs_hz)
 
 
-def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices:
+def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
     """Solve the regularised least-squares problem from factors.
 
     Parameters

@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike, Whole
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
 from ..core.rounding import ROUNDING
@@ -34,7 +34,6 @@ from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
 
 
@@ -54,7 +53,7 @@ class Factor:
 
     R: Array  # (..., n_columns, n_columns)
     peak: Array  # (..., n + n_basis + m + n_input_basis), largest magnitude of every column at k
-    n_samples: npt.NDArray[np.int64]  # (...)
+    n_samples: Whole  # (...)
     input_range: Array | None = None  # (..., 2, m), smallest and largest value of every recorded input
 
     def __getitem__(self, rows: Any) -> Factor:
@@ -113,7 +112,7 @@ def episode_factors(
     population: Population,
     keys: Mapping[str, Sequence[EpisodeKey]],
     lifting: Lifting,
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
+    parameters: Mapping[str, ArrayLike] | None = None,
 ) -> Factor:
     """Return factors of [Psi | Theta_plus] of every episode, for leaving episodes out and for drawing them again.
 
@@ -240,6 +239,6 @@ class Ranges:
         ends = None if ends is None else ends / self.inputs[: ends.shape[-1]]
         return replace(factor, R=self.triangles(factor.R), peak=peak, input_range=ends)
 
-    def edmd(self, R: Array, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices:
+    def edmd(self, R: Array, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
         """Return EDMD models of recorded channels whose regularisation acts on channels divided by the ranges."""
         return self.restore(edmd(self.triangles(R), len(self.outputs), alpha))

@@ -9,18 +9,14 @@ from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import DimensionError
 from ..lifting import Lifting
 from ..loops import Library, formulas, library
 
-Array = npt.NDArray[np.float64]
 
-
-def free_run(
-    A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.ArrayLike], x0: Array, u: Array
-) -> Array:
+def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, ArrayLike], x0: Array, u: Array) -> Array:
     """Simulate a batch of models, compiled where there is a compiler.
 
     Parameters
@@ -73,7 +69,7 @@ def free_run(
 
 
 def _in_numpy(
-    rows: Array, window: Array, lifting: Lifting, parameters: Mapping[str, npt.ArrayLike], before: Array, u: Array
+    rows: Array, window: Array, lifting: Lifting, parameters: Mapping[str, ArrayLike], before: Array, u: Array
 ) -> Array:
     """The reference: ``x+ = [A B] psi(w)`` for the states alone, sample by sample."""
     n, h = lifting.n_states, lifting.history
@@ -93,7 +89,7 @@ def _compiled(
     rows: Array,
     window: Array,
     lifting: Lifting,
-    parameters: Mapping[str, npt.ArrayLike],
+    parameters: Mapping[str, ArrayLike],
     before: Array,
     u: Array,
 ) -> Array:

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 from urllib.parse import quote
 
 import numpy as np
-import numpy.typing as npt
 
 from ..core.artifacts import Storable, load_artifact, loader, save_artifact
 from ..core.errors import DataError
@@ -21,7 +20,6 @@ from .factors import Factor
 from .model_set import KINDS, ModelSet, kinds_for
 from .survey import RecordingFacts
 
-Array = npt.NDArray[np.float64]
 T = TypeVar("T")
 _KIND = "models"
 

@@ -14,8 +14,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Flags
 from ..core.artifacts import digest_of
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
@@ -35,7 +35,6 @@ from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
 from .survey import RecordingFacts, check_usable, survey
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
 
 
@@ -183,7 +182,7 @@ class _Reduced:
         return self.condition == self.base.facts.identify_on
 
     @property
-    def pooled(self) -> npt.NDArray[np.bool_]:
+    def pooled(self) -> Flags:
         """Units that speak for the population."""
         return np.isin(self.units, list(self.base.facts.pooled))
 
@@ -273,7 +272,7 @@ def alpha_factor(shared: list[tuple[Array, int]], edge: float) -> float:
     return search.factor
 
 
-def require_stable(models: ModelSet, pooled: npt.NDArray[np.bool_]) -> None:
+def require_stable(models: ModelSet, pooled: Flags) -> None:
     """Refuse unstable models where they feed the synthesis."""
     for unit, status, counts in zip(models.unit_ids, models.status, pooled, strict=True):
         if counts and status != "ok":

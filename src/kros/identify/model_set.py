@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, Array, ArrayLike
 from ..core.artifacts import Storable, divided, load_artifact, loader, save_artifact, united
 from ..core.errors import ConfigError
 from ..core.frequency import log_grid
@@ -19,8 +18,6 @@ from ..data.population import Channel, Role
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
 from .factors import Ranges
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,11 +118,11 @@ class ModelSet(Storable):
         alpha = self.alpha or 0.0
         return self.ranges.edmd(R, alpha) if self.alpha_in_ranges else edmd(R, self.lifting.n_lifted, alpha)
 
-    def responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
+    def responses(self, freqs_hz: ArrayLike, units: Sequence[str] | None = None) -> AnyArray:
         """Return frequency responses from inputs to lifted states, shape (unit, frequency, n, m), in recorded units."""
         return np.asarray(self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale)
 
-    def scaled_responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
+    def scaled_responses(self, freqs_hz: ArrayLike, units: Sequence[str] | None = None) -> AnyArray:
         """Return the same with every signal divided by its range."""
         return self.normalised().systems(units).frequency_response(freqs_hz)
 

@@ -8,8 +8,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from ..core.files import did_you_mean
 from ..data.population import Population, split_episodes
@@ -19,7 +19,6 @@ from ..lifting.formula import Formula
 from .calibration import PhaseSpec
 from .settings import CalibrationSettings, LiftingSettings
 
-Array = npt.NDArray[np.float64]
 HARMONIC_DRIVE = "harmonic-drive"
 PHASE = "phase"
 _BAND = 0.1  # half the width of the band around the gearbox frequency, share of it

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, ArrayLike
 from ..core.errors import DataError
 from ..data.population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role
 from ..data.readers.arrays import as_numbers, from_arrays
 
-Array = npt.NDArray[np.float64]
-
 
 def from_pykoop(
-    X: npt.ArrayLike | Mapping[str, npt.ArrayLike],
+    X: ArrayLike | Mapping[str, ArrayLike],
     n_inputs: int,
     sample_period_s: float,
     *,

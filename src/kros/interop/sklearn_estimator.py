@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array, Whole
 from ..core.errors import ConfigError, DataError, IdentificationError, MissingDependencyError
 from ..core.rounding import ROUNDING
 from ..identify import edmd, free_run
@@ -28,8 +28,6 @@ except ImportError as error:
         "KoopmanRegressor needs scikit-learn 1.6 or newer; install it (pip install 'kros[sklearn]'), or use "
         "kros.identify."
     ) from error
-
-Array = npt.NDArray[np.float64]
 
 
 class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -207,7 +205,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         with np.errstate(all="ignore"):
             return np.asarray(np.concatenate([self.lifting_.lift(x), u], axis=1) @ W.T)
 
-    def _free_run(self, values: Array, edges: npt.NDArray[np.int64]) -> Array:
+    def _free_run(self, values: Array, edges: Whole) -> Array:
         """Run all episodes as one batch, the shorter ones on with zero inputs and then cut."""
         n, lengths = len(self.state_names_), np.diff(edges)
         inside = np.arange(lengths.max()) < lengths[:, None]
@@ -216,7 +214,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         with np.errstate(all="ignore"):
             return free_run(self.A_, self.B_, self.lifting_, {}, values[edges[:-1], :n], inputs)[inside]
 
-    def _read(self, X: Any, *, reset: bool) -> tuple[Array, npt.NDArray[np.int64]]:
+    def _read(self, X: Any, *, reset: bool) -> tuple[Array, Whole]:
         """Return states and inputs, and the first row of every episode with the number of rows."""
         values, ids = np.asarray(validate_data(self, X, reset=reset, dtype=np.float64)), None
         if self.episode_feature:

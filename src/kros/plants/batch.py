@@ -8,14 +8,12 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..core.errors import ConfigError
 from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Unit
 from ..data.prepare import assemble
 from ..data.recording import Recording, Recordings
-
-Array = npt.NDArray[np.float64]
 
 COUNT_RAD = 2 * np.pi / 4096  # of the encoder
 INPUT_STREAM, UNIT_STREAM, OUTLIER_STREAM, NOISE_STREAM = range(4)  # first words of spawn keys

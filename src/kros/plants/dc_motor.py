@@ -14,12 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..data.population import Channel, Role
 from .batch import Batch, UnitTruth
 
-Array = npt.NDArray[np.float64]
 CHANNELS = (
     Channel("position", Role.STATE, "rad", measured=True),
     Channel("velocity", Role.STATE, "rad/s"),

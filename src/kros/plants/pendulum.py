@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import Array
 from ..data.population import Channel, Role
 from .batch import Batch, UnitTruth
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

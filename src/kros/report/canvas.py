@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from math import ceil, floor, log10
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, ArrayLike
 from .names import RAISED, minus
 from .theme import DRAWING
 
@@ -21,11 +21,10 @@ if TYPE_CHECKING:
 else:  # for annotations alone: matplotlib is imported when something is drawn
     Artist = Axes = Figure = Any
 
-Array: TypeAlias = npt.NDArray[Any]
 _PREFIXES = "pnµm kMG"  # powers of a thousand, from 10⁻¹²
 
 
-def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, npt.NDArray[Any]]:
+def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, AnyArray]:
     """Return a figure in constrained layout and its axes, shape (rows, columns); `options` as in `Figure.subplots`."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -76,7 +75,7 @@ def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, fl
     axes.annotate(text, at, xytext=offset, textcoords="offset points", **settings)
 
 
-def thin(x: Array, y: Array) -> tuple[Array, Array]:
+def thin(x: AnyArray, y: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return a line with fewer points that looks the same: smallest and largest value of every bucket, in order."""
     count = DRAWING.points
     size = len(y) // count
@@ -88,19 +87,21 @@ def thin(x: Array, y: Array) -> tuple[Array, Array]:
     return x[rows], y[rows]
 
 
-def decibel(values: npt.ArrayLike) -> Array:
+def decibel(values: ArrayLike) -> AnyArray:
     """Return magnitudes in decibels; zero becomes NaN, which is not drawn."""
     magnitude = np.abs(np.asarray(values))
     return 20 * np.log10(np.where(magnitude > 0, magnitude, np.nan))
 
 
-def line_over_shade(axes: Axes, freqs_hz: Array, line: Array, shade: Array, colour: str, style: str = "-") -> None:
+def line_over_shade(
+    axes: Axes, freqs_hz: AnyArray, line: AnyArray, shade: AnyArray, colour: str, style: str = "-"
+) -> None:
     """Draw magnitudes over frequency in dB, above a broad light line of what they are compared with."""
     axes.plot(freqs_hz, decibel(shade), color=colour, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
     axes.plot(freqs_hz, decibel(line), style, color=colour)
 
 
-def lines_of_units(axes: Axes, x: Array, lines: Array, colour: str, label: str, units: Sequence[str]) -> None:
+def lines_of_units(axes: Axes, x: AnyArray, lines: AnyArray, colour: str, label: str, units: Sequence[str]) -> None:
     """Draw thin lines, shape (unit, x), a unit each, with their names; a unit without values is left out."""
     from matplotlib.collections import LineCollection
 
@@ -118,7 +119,7 @@ def name_units(drawn: Artist, units: Sequence[str]) -> None:
     drawn.set_gid("units-" + ",".join(quote(unit, safe="") for unit in units))
 
 
-def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)") -> None:
+def frequency_axis(axes: Axes, freqs_hz: AnyArray, label: str = "frequency (Hz)") -> None:
     """Make the horizontal axis logarithmic over the frequencies, with few numbers."""
     positive = freqs_hz[freqs_hz > 0]
     axes.set_xscale("log")

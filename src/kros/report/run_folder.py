@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray
 from ..core.artifacts import load_artifact, read_json
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
@@ -23,7 +23,6 @@ from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
 from .manifest import MANIFEST, recorded_files
 
-Array = npt.NDArray[Any]
 T = TypeVar("T")
 
 
@@ -36,11 +35,11 @@ class Shown:
     """One held-out episode with the estimates of observers and the predictions of models."""
 
     key: EpisodeKey
-    time_s: Array  # shape (n_samples,)
-    states: Array  # shape (n_samples, n)
-    inputs: Array  # shape (n_samples, m)
-    observers: Mapping[str, Array]  # mapping of str to ndarray, shape (n_samples, n)
-    models: Mapping[str, Array]  # mapping of str to ndarray, shape (n_samples, n)
+    time_s: AnyArray  # shape (n_samples,)
+    states: AnyArray  # shape (n_samples, n)
+    inputs: AnyArray  # shape (n_samples, m)
+    observers: Mapping[str, AnyArray]  # mapping of str to ndarray, shape (n_samples, n)
+    models: Mapping[str, AnyArray]  # mapping of str to ndarray, shape (n_samples, n)
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ class RunFolder:
         return self._evaluation[0]
 
     @cached_property
-    def _evaluation(self) -> tuple[dict[str, Any], dict[str, Array]]:
+    def _evaluation(self) -> tuple[dict[str, Any], dict[str, AnyArray]]:
         reason = "the observers have not been evaluated yet"
         return load_artifact(self._require("evaluation/evaluation.json", reason), "evaluation")
 
@@ -169,7 +168,7 @@ class RunFolder:
         content, arrays = self._evaluation
         return [self._shown(arrays, f"shown{k}/", EpisodeKey(*row)) for k, row in enumerate(content["shown"])]
 
-    def _shown(self, arrays: Mapping[str, Array], start: str, key: EpisodeKey) -> Shown:
+    def _shown(self, arrays: Mapping[str, AnyArray], start: str, key: EpisodeKey) -> Shown:
         """Return one episode from the arrays whose names begin with `start`."""
         part = {name.removeprefix(start): values for name, values in arrays.items() if name.startswith(start)}
         observers, models = (

@@ -9,14 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray
 from ..core.errors import DimensionError, SynthesisError
 from ..core.linalg import balanced_size
 from ..core.rounding import ITERATED, ROUNDING, TINY
 from .generalized_plant import GeneralizedPlant
-
-Array = npt.NDArray[Any]
 
 # Label and remedy of each assumption.
 STABILISABLE = "A1a: (A, B2) stabilisable", "make the weights stable or let the control reach this mode"
@@ -34,7 +32,7 @@ NO_ZERO_MEASUREMENT = (
 PROPER = "D11 = 0 in continuous time", "use a strictly proper weight"
 
 
-def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
+def unreachable_modes(A: AnyArray, B: AnyArray, dt: float) -> list[complex]:
     """Return the eigenvalues on or beyond the stability boundary that B does not reach (Hautus test)."""
     A, B = _balanced(A, B)
     modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
@@ -77,7 +75,7 @@ def require(plant: Any, method: str, proper: bool = True) -> None:
         raise SynthesisError(f"{method} needs a regular generalized plant; violated: {'; '.join(failed)}.")
 
 
-def require_detectable(A: Array, C: Array, dt: float, method: str) -> None:
+def require_detectable(A: AnyArray, C: AnyArray, dt: float, method: str) -> None:
     """Raise a `SynthesisError` naming the first mode on or beyond the stability boundary that C does not see."""
     modes = unreachable_modes(A.T, C.T, dt)
     if modes:
@@ -85,7 +83,7 @@ def require_detectable(A: Array, C: Array, dt: float, method: str) -> None:
         raise SynthesisError(f"{method}: (A, C) is not detectable, {problem}; measure another state.")
 
 
-def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
+def _balanced(A: AnyArray, B: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Balance A and make B as large as A, so that a test does not depend on units."""
     if not A.size:
         return A, B
@@ -95,12 +93,12 @@ def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
     return A, B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), TINY)
 
 
-def _rank(matrix: Array) -> int:
+def _rank(matrix: AnyArray) -> int:
     values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.zeros(0)
     return int(np.sum(values > ITERATED * max(values.max(initial=0.0), TINY)))
 
 
-def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[complex]:
+def _boundary_zeros(A: AnyArray, B: AnyArray, C: AnyArray, D: AnyArray, dt: float) -> list[complex]:
     """Zeros on the stability boundary: D of full column rank, eigenvalues of A - B D^+ C that the rest of C sees."""
     pinv = np.linalg.pinv(D)
     inner, seen = _balanced((A - B @ pinv @ C).T, (C - D @ (pinv @ C)).T)

@@ -9,16 +9,13 @@ K : controller with matrices A^c, B^c, C^c, D^c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, real_array, sampling_period
 from ..core.rounding import SINGULAR
-
-Array = npt.NDArray[Any]
 
 _MATRICES = ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21", "D22")
 
@@ -55,15 +52,15 @@ class GeneralizedPlant:
     True
     """
 
-    A: Array  # (n, n)
-    B1: Array  # (n, n_w)
-    B2: Array  # (n, n_u)
-    C1: Array  # (n_z, n)
-    C2: Array  # (n_y, n)
-    D11: Array  # (n_z, n_w)
-    D12: Array  # (n_z, n_u)
-    D21: Array  # (n_y, n_w)
-    D22: Array  # (n_y, n_u)
+    A: AnyArray  # (n, n)
+    B1: AnyArray  # (n, n_w)
+    B2: AnyArray  # (n, n_u)
+    C1: AnyArray  # (n_z, n)
+    C2: AnyArray  # (n_y, n)
+    D11: AnyArray  # (n_z, n_w)
+    D12: AnyArray  # (n_z, n_u)
+    D21: AnyArray  # (n_y, n_w)
+    D22: AnyArray  # (n_y, n_u)
     dt: float  # s; 0 means continuous time
     n_w1: int | None = None  # for `mixed`: so many disturbances are w1 (performance), the others w2; default all
     n_z1: int | None = None  # for `mixed`: so many outputs are z1, the others z2; default all
@@ -101,7 +98,7 @@ class GeneralizedPlant:
         split = self.sizes[1] if self.n_w1 is None else self.n_w1
         return slice(0, split) if channel == 1 else slice(split, None)
 
-    def channel(self, rows: slice | Array, columns: slice | Array) -> GeneralizedPlant:
+    def channel(self, rows: slice | AnyArray, columns: slice | AnyArray) -> GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""
         C1, D12, D11 = self.C1[rows], self.D12[rows], self.D11[rows][:, columns]
         B1, D21 = self.B1[:, columns], self.D21[:, columns]
@@ -110,11 +107,11 @@ class GeneralizedPlant:
     def transformed(
         self,
         *,
-        x: tuple[Array, Array] | None = None,
-        z: Array | None = None,
-        w: Array | None = None,
-        y: Array | None = None,
-        u: Array | None = None,
+        x: tuple[AnyArray, AnyArray] | None = None,
+        z: AnyArray | None = None,
+        w: AnyArray | None = None,
+        y: AnyArray | None = None,
+        u: AnyArray | None = None,
     ) -> GeneralizedPlant:
         """Return the plant in the states ``T x`` for ``x = (T, T^-1)``, outputs multiplied by z, y, inputs by w, u."""
         n, n_w, n_u, n_z, n_y = self.sizes

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, ArrayLike
 from ..core.errors import ConfigError
 from ..core.frequency import check_grid, log_grid
 from ..core.linalg import sigma_max
@@ -23,12 +23,10 @@ from .nominal import NominalChoice, choose_nominal
 from .settings import SET
 from .weights.fit import Residuals, fit_weight
 
-Array = npt.NDArray[Any]
-
 _LOG = logging.getLogger(__name__)
 
 
-def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, options: Options) -> UncertainModel:
+def bound_systems(models: Any, form: Form, freqs_hz: ArrayLike | None, options: Options) -> UncertainModel:
     """Return the set of systems."""
     system, options = read_systems(models, options)
     scales, ids = options.scales(system.D.shape[-2:]), options.ids(system.batch_shape[0])
@@ -49,7 +47,7 @@ def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, optio
 
 
 def bound_responses(
-    responses: Array, form: Form, freqs_hz: npt.ArrayLike | None, options: Options
+    responses: AnyArray, form: Form, freqs_hz: ArrayLike | None, options: Options
 ) -> ResponseUncertainty:
     """Return the set of frequency responses, shape (unit, frequency, p, m)."""
     dt, ids = options.sample_period_s, options.ids(len(responses))
@@ -73,12 +71,12 @@ def bound_responses(
     return ResponseUncertainty(nominal_response=G[index], certificate=certificate, **fields)
 
 
-def _choices(responses: Array) -> dict[Form, NominalChoice]:
+def _choices(responses: AnyArray) -> dict[Form, NominalChoice]:
     """Return the best nominal of every form."""
     return {form: choose_nominal(responses, form) for form in Form}
 
 
-def _certificate(freqs: Array, bound: Array) -> str:
+def _certificate(freqs: AnyArray, bound: AnyArray) -> str:
     """Return where a bound of responses holds, and which of its peaks the frequencies do not resolve."""
     text = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
     middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
@@ -91,7 +89,7 @@ def _certificate(freqs: Array, bound: Array) -> str:
     return text
 
 
-def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
+def _between(freqs: AnyArray, values: AnyArray, at_hz: AnyArray) -> AnyArray:
     """Return responses (unit, frequency, p, m) at other frequencies, on straight lines, constant beyond the ends."""
     from scipy.interpolate import make_interp_spline
 
@@ -100,7 +98,7 @@ def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
 
 def _bound(
     residuals: Residuals,
-    freqs: Array,
+    freqs: AnyArray,
     target: tuple[float, int, float],
     ids: tuple[str, ...],
     index: int,
@@ -125,7 +123,7 @@ def _bound(
     return fields | {"cover": cover, "weight": weight, "remainder": remainder}
 
 
-def _leaves_out(form: Form, ratio: Array) -> bool:
+def _leaves_out(form: Form, ratio: AnyArray) -> bool:
     """Tell whether an additive remainder is needed, and warn."""
     unknown = int(np.isnan(ratio).sum())
     if unknown:

@@ -26,14 +26,12 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, ArrayLike
 from ..core.errors import DataError, DimensionError
 from ..core.linalg import sigma_max
 from ..core.settings import member
 from .settings import SET
-
-Array = npt.NDArray[Any]
 
 
 class Form(StrEnum):
@@ -67,7 +65,7 @@ def as_form(form: Form | str) -> Form:
     return member(Form, form, "Uncertainty form")
 
 
-def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike, *, paper: bool = False) -> Array:
+def residual(form: Form | str, nominal: ArrayLike, perturbed: ArrayLike, *, paper: bool = False) -> AnyArray:
     """Return the residual E between a nominal and perturbed plants.
 
     Parameters
@@ -114,7 +112,7 @@ def residual_of(form: Form, G: Any, Gp: Any, pinv: Callable[[Any], Any]) -> Any:
     return product @ pinv(G) if form is Form.INVERSE_ADDITIVE else product
 
 
-def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
+def rebuild(form: Form | str, nominal: ArrayLike, E: ArrayLike) -> AnyArray:
     """Return the perturbed plants, shape (..., p, m), that a nominal and residuals stand for.
 
     Examples
@@ -146,7 +144,7 @@ def loop_of(form: Form, G: Any, E: Any) -> Any:
     return E @ G if form is Form.INVERSE_ADDITIVE else E
 
 
-def misfit(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -> Array:
+def misfit(form: Form | str, nominal: ArrayLike, responses: ArrayLike) -> AnyArray:
     """Return what the form cannot rebuild: `sigma_max(rebuilt Gp - Gp) / sigma_max(Gp)`.
 
     Parameters
@@ -175,7 +173,7 @@ def misfit(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -
     return np.where(regular, ratio, np.nan)
 
 
-def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -> tuple[Array, Array, Array]:
+def completion(form: Form | str, nominal: ArrayLike, responses: ArrayLike) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Return residuals, zero where an inverse form is near singular, the remainder, and where it is not."""
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp)
@@ -187,7 +185,7 @@ def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLik
     return E, Gp - rebuild(form, G, E), regular
 
 
-def check_responses(responses: Any, ids: Sequence[str] | None = None, freqs_hz: Array | None = None) -> Array:
+def check_responses(responses: Any, ids: Sequence[str] | None = None, freqs_hz: AnyArray | None = None) -> AnyArray:
     """Return responses (unit, frequency, p, m), or say which one is not like the first, or not finite."""
     arrays = [np.asarray(one) for one in responses]
     names = ids or [str(k) for k in range(len(arrays))]
@@ -210,7 +208,7 @@ def check_responses(responses: Any, ids: Sequence[str] | None = None, freqs_hz: 
     return G
 
 
-def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Array]:
+def _plants(nominal: ArrayLike, perturbed: ArrayLike) -> tuple[AnyArray, AnyArray]:
     G, Gp = np.asarray(nominal), np.asarray(perturbed)
     if G.ndim < 2 or Gp.ndim < 2 or G.shape[-2:] != Gp.shape[-2:]:
         problem = f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}"
@@ -218,7 +216,7 @@ def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Ar
     return G, Gp
 
 
-def _inverse(matrices: Array) -> Array:
+def _inverse(matrices: AnyArray) -> AnyArray:
     """Inverses, NaN where a matrix is singular."""
     regular = (np.linalg.cond(matrices) < 1 / np.finfo(float).eps)[..., None, None]
     return np.where(regular, np.linalg.inv(np.where(regular, matrices, np.eye(matrices.shape[-1]))), np.nan)

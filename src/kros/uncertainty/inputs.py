@@ -6,16 +6,14 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
+from ..core.arrays import AnyArray, ArrayLike
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace
 from ..core.rounding import ITERATED
 from ..core.settings import Settings
 from .forms import check_responses
-
-Array = npt.NDArray[Any]
 
 
 class Options(Settings):
@@ -29,7 +27,7 @@ class Options(Settings):
     tolerance_db: float = Field(1.0, ge=0)
     sample_period_s: float | None = None
 
-    def scales(self, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    def scales(self, shape: tuple[int, ...]) -> tuple[AnyArray, AnyArray]:
         """Return the ranges of outputs and inputs."""
         return check_scale("output", self.output_scale, shape[0]), check_scale("input", self.input_scale, shape[1])
 
@@ -92,13 +90,13 @@ def stack_systems(models: Any) -> StateSpace:
     return models
 
 
-def _padded(system: StateSpace, more: int) -> tuple[Array, Array, Array, Array]:
+def _padded(system: StateSpace, more: int) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     """Return A, B, C, D with further states without input and output, at rest after a sample."""
     B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
     return np.pad(system.A, (0, more)), B, C, system.D
 
 
-def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
+def check_scale(side: str, values: ArrayLike | None, size: int) -> AnyArray:
     """Return ranges as an array, ones by default, or say what is wrong with them."""
     scale = np.ones(size) if values is None else np.asarray(values, float)
     if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
@@ -116,7 +114,7 @@ def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
             raise DataError(f"Quantify: {problem}; identify with more regularisation or leave it out.")
 
 
-def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[Array, Array]:
+def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[AnyArray, AnyArray]:
     """Return responses (frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
     first = data[0]
     for k, other in enumerate(data):

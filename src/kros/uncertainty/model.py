@@ -9,17 +9,14 @@ S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray
 from ..core.artifacts import Storable
 from ..core.lti import StateSpace
 from .forms import Form
 from .weights.cover import Cover, Weight
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -30,15 +27,17 @@ class Uncertainty:
     unit_ids: tuple[str, ...]  # units that the weights cover
     nominal: int  # row of the nominal unit
     nominal_id: str
-    freqs_hz: Array  # (frequency,), Hz
-    output_scale: Array  # (p,)
-    input_scale: Array  # (m,)
+    freqs_hz: AnyArray  # (frequency,), Hz
+    output_scale: AnyArray  # (p,)
+    input_scale: AnyArray  # (m,)
     # (frequency,): largest residual over the other units for the best nominal of each form, and that of `form`
-    bounds: dict[Form, Array]
+    bounds: dict[Form, AnyArray]
     nominals: dict[Form, str]  # unit behind each of these bounds
     cover: Cover  # optimal cover of the residuals, frequency by frequency
     weight: Weight
-    misfit: Array  # (unit, frequency): what the form cannot rebuild, relative to the unit; NaN near singular inverses
+    misfit: (
+        AnyArray  # (unit, frequency): what the form cannot rebuild, relative to the unit; NaN near singular inverses
+    )
     remainder: Weight | None = None  # for `Gp - rebuilt(G, E)`, additive, where the form does not rebuild every unit
 
     @property
@@ -92,7 +91,7 @@ class ResponseUncertainty(Uncertainty):
     ('1', True)
     """
 
-    nominal_response: Array
+    nominal_response: AnyArray
     sample_period_s: float
     certificate: str
 
@@ -137,7 +136,7 @@ class UncertainModel(Uncertainty, Storable):
         return scale_system(self.nominal_system, self.output_scale, self.input_scale)
 
 
-def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
+def scale_system(system: StateSpace, output_scale: AnyArray, input_scale: AnyArray) -> StateSpace:
     """Return `S_y^-1 G S_u`; states that are the outputs are scaled with them."""
     rows = 1.0 / output_scale[:, None]
     if system.n_states == len(output_scale) and np.all(np.eye(system.n_states) == system.C):

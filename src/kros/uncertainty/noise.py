@@ -18,11 +18,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
 from ..core.linalg import sigma_max, squared
@@ -30,20 +29,18 @@ from ..identify.bootstrap import ModelSamples
 from .forms import Form, residual
 from .settings import OUTLIER
 
-Array = npt.NDArray[Any]
-
 
 @dataclass(frozen=True, eq=False)
 class NoiseShare:
     """Mean squared residuals of a population and the part of them that recordings explain."""
 
-    freqs_hz: Array  # (frequency,), Hz
-    total: Array  # (frequency,): mean squared Frobenius norm of residuals between units
-    noise: Array  # (frequency,): the same between resampled models of one unit
-    largest: Array  # (frequency,): largest singular value of the residuals against the nominal unit
+    freqs_hz: AnyArray  # (frequency,), Hz
+    total: AnyArray  # (frequency,): mean squared Frobenius norm of residuals between units
+    noise: AnyArray  # (frequency,): the same between resampled models of one unit
+    largest: AnyArray  # (frequency,): largest singular value of the residuals against the nominal unit
 
     @property
-    def ratio(self) -> Array:
+    def ratio(self) -> AnyArray:
         """Noise over total, shape (frequency,); above one where chance has it, zero where there is neither."""
         return np.divide(self.noise, self.total, out=np.where(self.noise > 0, np.inf, 0.0), where=self.total > 0)
 
@@ -58,7 +55,7 @@ class NoiseShare:
 
 
 def noise_share(
-    models: ModelSamples, scale: Array, freqs_hz: Array, sample_period_s: float, form: Form, nominal: int = 0
+    models: ModelSamples, scale: AnyArray, freqs_hz: AnyArray, sample_period_s: float, form: Form, nominal: int = 0
 ) -> NoiseShare:
     """Compare the residuals between units with those between resampled models, of responses divided by `scale`."""
     (units, draws, _, n), m = models.samples.A.shape, models.samples.B.shape[-1]
@@ -81,6 +78,6 @@ def noise_share(
     return NoiseShare(freqs_hz, between * units / (units - 1), noise, largest)
 
 
-def _mean_square(E: Array) -> Array:
+def _mean_square(E: AnyArray) -> AnyArray:
     """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
     return np.asarray(squared(E).sum(axis=(-2, -1)).mean(axis=0))

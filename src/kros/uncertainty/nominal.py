@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray, ArrayLike
 from ..core.linalg import sigma_max
 from ..identify.refine.minimax import smallest_largest
 from .forms import Form, as_form, check_responses, residual
 from .settings import SET
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +18,10 @@ class NominalChoice:
     """Best nominal of one form."""
 
     index: int  # row of the chosen unit
-    bound: Array  # (frequency,): largest residual over the other units
+    bound: AnyArray  # (frequency,): largest residual over the other units
 
 
-def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
+def choose_nominal(responses: ArrayLike, form: Form | str) -> NominalChoice:
     """Return the unit with the lowest peak residual against all others; exact, and without visiting all pairs of units.
 
     Parameters
@@ -60,12 +57,12 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     n_units, n_freqs = G.shape[:2]
     step = max(1, SET.at_once // n_freqs)
 
-    def against(rows: Array, witness: Array) -> Array:
+    def against(rows: AnyArray, witness: AnyArray) -> AnyArray:
         """Residuals of the witness of every frequency for some nominals, shape (nominal, frequency)."""
         parts, worst = np.split(rows, range(step, len(rows), step)), G[witness, np.arange(n_freqs)]
         return np.concatenate([sigma_max(residual(form, G[part], worst)) for part in parts])
 
-    def bound(row: int) -> tuple[Array, Array]:
+    def bound(row: int) -> tuple[AnyArray, AnyArray]:
         """Largest residual over the units and which unit it is, shape (frequency,)."""
         parts = (G[k : k + step] for k in range(0, n_units, step))
         sizes = np.concatenate([sigma_max(residual(form, G[row], part)) for part in parts])

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import ArrayLike
 from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
 from ..core.errors import ConfigError, IdentificationError
 from ..core.linalg import sigma_max
@@ -31,8 +31,6 @@ from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import QuantifySettings
 from .unit_residuals import UnitResiduals, unit_residuals
-
-Array = npt.NDArray[Any]
 
 _KIND = "choice"
 _FACTS = ("nominal", "worst_off_nominal")
@@ -99,7 +97,7 @@ class UncertainModels:
 def quantify(
     models: Any,
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE,
-    freqs_hz: npt.ArrayLike | None = None,
+    freqs_hz: ArrayLike | None = None,
     *,
     work: Work | None = None,
     **options: Any,

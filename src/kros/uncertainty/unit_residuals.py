@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ..core.arrays import AnyArray
 from ..core.artifacts import Storable
 from ..core.errors import DimensionError
 from ..core.linalg import sigma_max
@@ -26,8 +26,6 @@ from .forms import Form, residual
 from .settings import SET
 from .weights.cover import Cover, Weight
 from .weights.magnitude import fit_magnitude
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +37,12 @@ class UnitResiduals(Storable):
     nominal_id: str
     unit_ids: tuple[str, ...]  # covered units, and others
     outside: tuple[str, ...]  # units that the weights do not have to cover
-    freqs_hz: Array  # (frequency,), Hz
-    entries: Array  # (unit, frequency, p', m'): magnitudes of the residual's entries, in scaled coordinates
-    ratio: Array  # (unit, frequency): ``sigma_max(W_L^-1 E W_R^-1)``
-    largest: Array  # (frequency, p', m'): largest entries of all covered units
-    entry_weights: Array  # (frequency, p', m')
-    entry_orders: Array  # (p', m')
+    freqs_hz: AnyArray  # (frequency,), Hz
+    entries: AnyArray  # (unit, frequency, p', m'): magnitudes of the residual's entries, in scaled coordinates
+    ratio: AnyArray  # (unit, frequency): ``sigma_max(W_L^-1 E W_R^-1)``
+    largest: AnyArray  # (frequency, p', m'): largest entries of all covered units
+    entry_weights: AnyArray  # (frequency, p', m')
+    entry_orders: AnyArray  # (p', m')
     entry_excess: float = float("nan")
 
     def rows(self, *, inside: bool) -> list[int]:
@@ -54,10 +52,10 @@ class UnitResiduals(Storable):
 
 def unit_residuals(
     form: Form,
-    nominal: tuple[str, Array],
-    responses: Mapping[str, Array],
+    nominal: tuple[str, AnyArray],
+    responses: Mapping[str, AnyArray],
     weights: Weight | Cover,
-    freqs_hz: Array,
+    freqs_hz: AnyArray,
     sample_period_s: float,
     outside: Collection[str] = (),
 ) -> UnitResiduals:
@@ -78,12 +76,12 @@ class EntryWeights:
     """Bounds of entries at frequencies."""
 
     system: StateSpace  # p' by m'
-    orders: Array  # (p', m')
+    orders: AnyArray  # (p', m')
     excess: float  # largest `sigma_max(W^-1 E_k)`: above one, a full perturbation does not cover the residuals
 
 
 def fit_entries(
-    E: Array, freqs_hz: Array, sample_period_s: float, max_order: int = 4, tolerance_db: float = 1.0
+    E: AnyArray, freqs_hz: AnyArray, sample_period_s: float, max_order: int = 4, tolerance_db: float = 1.0
 ) -> EntryWeights:
     """Return one magnitude for every entry of residuals (unit, frequency, p', m')."""
     p, m = E.shape[2:]
@@ -97,7 +95,7 @@ def fit_entries(
     return EntryWeights(system, orders, _excess(system.frequency_response(freqs_hz), E))
 
 
-def _excess(W: Array, E: Array) -> float:
+def _excess(W: AnyArray, E: AnyArray) -> float:
     """Return the largest ``sigma_max(W^-1 E)`` of weights (frequency, p, p) over residuals."""
     if W.shape[-1] != W.shape[-2] or not np.abs(W).max():
         return float("nan")

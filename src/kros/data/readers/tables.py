@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core import limits
-from ...core.arrays import Array
+from ...core.arrays import AnyArray, Array
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened
 from ..measures import clean_unit, is_unit_row, split_header
@@ -230,7 +229,7 @@ def microseconds(column: Any, order: str) -> Array:
 # Between NumPy and Arrow through bare buffers: the ways of pyarrow import pandas, which costs half a second.
 
 
-def from_numpy(values: npt.NDArray[Any]) -> Any:
+def from_numpy(values: AnyArray) -> Any:
     """Return an Arrow array without nulls that shares the memory of contiguous numbers."""
     import pyarrow as pa
 

@@ -13,19 +13,15 @@ which is quadratic below `level`; a power above one flattens the residual's peak
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array
 from ...core.linalg import adjoint, entries_first, multiply, sigma_max_first
 from .minimax import smallest_largest
 
-Array = npt.NDArray[np.float64]
-Complex = npt.NDArray[Any]
 
-
-def unit_circle(points: int, decades: int = 6) -> Complex:
+def unit_circle(points: int, decades: int = 6) -> AnyArray:
     """Return ``exp(j omega)`` at logarithmic frequencies, some decades below Nyquist up to it."""
     return np.asarray(np.exp(1j * np.pi * np.logspace(-decades, 0, points)))
 
@@ -46,7 +42,7 @@ class ResponsePrior:
         """Return the same prior with another weight."""
         return replace(self, weight=weight)
 
-    def residual(self, V: Array) -> tuple[Complex, Complex, Complex]:
+    def residual(self, V: Array) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return E (unit, frequency, m, m) of models V, ``G^+ Phi`` and ``T^T Z (I - E)``."""
         W = V @ self.T.T
         n, m = self.B.shape
@@ -87,11 +83,11 @@ def peak_residual(A: Array, B: Array, points: int = 200) -> float:
     G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
     inverse, G, every = entries_first(np.linalg.pinv(G)), entries_first(G), np.arange(points)  # (m, n, unit, frequency)
 
-    def bound_of(row: int) -> tuple[Complex, Complex]:
+    def bound_of(row: int) -> tuple[AnyArray, AnyArray]:
         sizes = sigma_max_first(multiply(inverse, G[:, :, row, None] - G))
         return sizes.max(axis=0), sizes.argmax(axis=0)
 
-    def against(rows: Complex, witness: Complex) -> Complex:
+    def against(rows: AnyArray, witness: AnyArray) -> AnyArray:
         farthest = G[:, :, None, witness, every]
         return sigma_max_first(multiply(inverse[:, :, None, witness, every], G[:, :, rows] - farthest))
 

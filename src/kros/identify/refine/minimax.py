@@ -11,23 +11,20 @@ so that few rounds are needed; each visits as many pairs as there are units, not
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.rounding import ITERATED
-
-Array = npt.NDArray[Any]
 
 TIE = ITERATED  # relative; scores closer than rounding are one
 
 
 def smallest_largest(
     shape: tuple[int, int],
-    bound_of: Callable[[int], tuple[Array, Array]],
-    against: Callable[[Array, Array], Array],
-) -> tuple[int, Array, Array, Array]:
+    bound_of: Callable[[int], tuple[AnyArray, AnyArray]],
+    against: Callable[[AnyArray, AnyArray], AnyArray],
+) -> tuple[int, AnyArray, AnyArray, AnyArray]:
     """Return the best candidate, its bound, all scores (lower bounds where not evaluated), and which are exact."""
     lower, scores, evaluated = np.zeros(shape), np.zeros(shape[0]), np.zeros(shape[0], bool)
     best, row = np.inf, 0

@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Flags, Whole
 from ...core.errors import IdentificationError
 from ...core.linalg import qr_triangle, radius_text
 from ...core.rounding import EPS, TINY
@@ -30,8 +30,6 @@ from .search import Evaluate, GaussNewton, RefineOptions, Solution
 from .segments import Segments, TrainingData, held_segments, read_segments
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
 
 
 def refine_population(
@@ -40,7 +38,7 @@ def refine_population(
     lifting: Lifting,
     parameters: Mapping[str, Array],
     factor: Factor,
-    pooled: npt.NDArray[np.bool_] | None = None,
+    pooled: Flags | None = None,
     options: RefineOptions | None = None,
 ) -> KoopmanMatrices:
     """Refine the models of a population on free-run error.
@@ -144,7 +142,7 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
 def _fit(problem: RefinementProblem, V: Array, search: GaussNewton) -> Solution:
     """Fit every unit by itself; those that are done are not run on."""
 
-    def narrowed(rows: Rows) -> Evaluate:
+    def narrowed(rows: Whole) -> Evaluate:
         return problem.of_units(rows).evaluate
 
     return search.minimise(problem.evaluate, problem.admissible, V, narrowed)

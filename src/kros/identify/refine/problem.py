@@ -24,8 +24,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Flags, Whole
 from ...core.rounding import TINY
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
@@ -34,9 +34,6 @@ from .metric import ResponsePrior
 from .search import RefineOptions
 from .segments import Segments
 from .sensitivity import Normal, normal_equations
-
-Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +45,7 @@ class OneStep:
     variance: Array  # (f,)
 
     @classmethod
-    def of(cls, factor: Factor, T: Array, n_states: int, pooled: Rows, least_variance: float = 1e-10) -> OneStep:
+    def of(cls, factor: Factor, T: Array, n_states: int, pooled: Whole, least_variance: float = 1e-10) -> OneStep:
         """Read them from factors of ``[Psi | Theta_plus]``; `pooled` units set the variance.
 
         The variance is at least a share of the function's mean square: an earlier value is predicted exactly.
@@ -113,14 +110,14 @@ class RefinementProblem:
         """Return the same problem at a horizon up to that of the segments."""
         return replace(self, segments=self.segments.cut(horizon))
 
-    def of_units(self, rows: Rows) -> RefinementProblem:
+    def of_units(self, rows: Whole) -> RefinementProblem:
         """Return the problem of some units, with the same weights."""
         values = {name: given[rows] for name, given in self.parameters.items()}
         one_step = replace(self.one_step, matrix=self.one_step.matrix[rows], least=self.one_step.least[rows])
         part = replace(self, parameters=values, segments=self.segments.units(rows), one_step=one_step)
         return replace(part, counted=self.residuals)
 
-    def of_one_model(self, rows: Rows) -> RefinementProblem:
+    def of_one_model(self, rows: Whole) -> RefinementProblem:
         """Return the problem of one model for some units."""
         return replace(self.of_units(rows), pooled=True, counted=None)
 
@@ -129,7 +126,7 @@ class RefinementProblem:
         assert self.prior is not None
         return replace(self, prior=self.prior.scaled(strength * self.residuals))
 
-    def admissible(self, V: Array) -> npt.NDArray[np.bool_]:
+    def admissible(self, V: Array) -> Flags:
         """Return which models are finite and stable as linear systems."""
         A = (V @ self.T.T)[..., : self.lifting.n_lifted]
         finite = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
@@ -141,7 +138,7 @@ class RefinementProblem:
         W, n_lifted = V @ self.T.T, self.lifting.n_lifted
         return KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:])
 
-    def finite(self, V: Array) -> npt.NDArray[np.bool_]:
+    def finite(self, V: Array) -> Flags:
         """Return which models hold numbers only."""
         return np.asarray(np.isfinite(V).all(axis=(-1, -2)))
 

@@ -6,13 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Flags, Whole
 from ...core.rounding import EPS, TINY
 
-Array = npt.NDArray[np.float64]
 Evaluate = Callable[[Array], Array]
-Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +49,9 @@ class GaussNewton:
     def minimise(
         self,
         evaluate: Evaluate,
-        admissible: Callable[[Array], npt.NDArray[np.bool_]],
+        admissible: Callable[[Array], Flags],
         V: Array,
-        narrowed: Callable[[Rows], Evaluate] | None = None,
+        narrowed: Callable[[Whole], Evaluate] | None = None,
     ) -> Solution:
         """Return the minima from the start V (problem, rows, columns).
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array, Flags, Whole
 from ...core.errors import DataError
 from ...data.population import EpisodeKey, Population
 from ...data.prepare import scale_population
 from ...lifting import Lifting
 from ..factors import Factor, Ranges
 
-Array = npt.NDArray[np.float64]
 Keys = Mapping[str, Sequence[EpisodeKey]]
 
 
@@ -28,10 +26,10 @@ class TrainingData:
     lifting: Lifting
     parameters: Mapping[str, Array]  # (unit,)
     factor: Factor  # batch over units
-    pooled: npt.NDArray[np.bool_]  # (unit,)
+    pooled: Flags  # (unit,)
 
     @property
-    def rows(self) -> npt.NDArray[np.int64]:
+    def rows(self) -> Whole:
         """Rows of the pooled units."""
         return np.flatnonzero(self.pooled)
 
@@ -52,7 +50,7 @@ class Segments:
 
     states: Array  # (n_samples, n, unit, segment)
     inputs: Array  # (n_samples, m, unit, segment)
-    valid: npt.NDArray[np.bool_]  # (n_samples, unit, segment)
+    valid: Flags  # (n_samples, unit, segment)
     history: int = 0
 
     @property
@@ -66,11 +64,11 @@ class Segments:
         return len(self.valid) - 1 - self.history
 
     @property
-    def compared(self) -> npt.NDArray[np.bool_]:
+    def compared(self) -> Flags:
         """Which samples a free run is compared with, shape (horizon, unit, segment)."""
         return self.valid[self.history + 1 :]
 
-    def units(self, rows: npt.NDArray[Any]) -> Segments:
+    def units(self, rows: AnyArray) -> Segments:
         """Return the segments of some units."""
         return self._each(lambda values: values[..., rows, :])
 
@@ -85,13 +83,13 @@ class Segments:
         spread = np.unique(np.linspace(0, pieces * n_segments - 1, n_segments).round().astype(int))
         samples = np.arange(self.history + length)[:, None] + length * np.arange(pieces)  # (sample, piece)
 
-        def fold(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        def fold(values: AnyArray) -> AnyArray:
             moved = np.moveaxis(values[samples], 1, -1)  # (sample, .., segment, piece)
             return moved.reshape(*moved.shape[:-2], -1)[..., spread]
 
         return self._each(fold)
 
-    def _each(self, change: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]) -> Segments:
+    def _each(self, change: Callable[[AnyArray], AnyArray]) -> Segments:
         states, inputs, valid = (np.ascontiguousarray(change(a)) for a in (self.states, self.inputs, self.valid))
         return Segments(states, inputs, valid, self.history)
 

@@ -22,13 +22,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Flags
 from ...lifting import Lifting
 from ...loops import Library, formulas, library
 from .segments import Segments
 
-Array = npt.NDArray[np.float64]
 Past = tuple[int, int, int]
 _AT_ONCE = 500_000  # numbers in memory: residuals and how they move
 
@@ -85,7 +84,7 @@ class _Run:
     parameters: Mapping[str, Array]
     x: Array
     u: Array
-    valid: npt.NDArray[np.bool_]
+    valid: Flags
     sigma: Array
     stride: int
     units: int
@@ -157,7 +156,7 @@ class _Run:
             F += np.einsum("afb,bfj->ajb", W[:, nl + len(u) :], slopes)
         return F
 
-    def _residuals(self, S: Array, error: Array, valid: npt.NDArray[np.bool_]) -> Array:
+    def _residuals(self, S: Array, error: Array, valid: Flags) -> Array:
         """``[J r]^T`` of one sample; J = dx/dV / sigma."""
         rows = np.concatenate([S, error[:, None]], axis=1) / self.sigma[:, None, None]  # (n, n p + 1, batch)
         rows[:, :, ~valid] = 0.0

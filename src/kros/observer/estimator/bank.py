@@ -15,13 +15,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Whole
 from ...core.rounding import ITERATED
 from .channels import Channels
 from .settings import EstimatorSettings
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +49,13 @@ class Bank:
         return len(self.channel)
 
     @property
-    def channel(self) -> npt.NDArray[np.int64]:
+    def channel(self) -> Whole:
         """Channel of every entry, shape (len(self),)."""
         every, moving = np.arange(self.channels), np.arange(self.channels - 1)
         blocks = [moving[: self.delayed]] * (len(self.taps) - 2)
         return np.concatenate([moving, *blocks, *[moving] * len(self.lags), *[every] * len(self.starts), every[-1:]])
 
-    def rows(self, v: Array, at: npt.NDArray[np.int64]) -> Array:
+    def rows(self, v: Array, at: Whole) -> Array:
         """Return the bank at samples `at` of signals v (n_samples, channels), shape (len(at), len(self))."""
         moving, past = v[:, :-1], v[:, : self.delayed]
         before = np.concatenate([np.repeat(past[:1], self.taps[-1], axis=0), past])
@@ -130,7 +128,7 @@ class Bank:
         return A, B, S
 
 
-def lagged(v: Array, a: Array, at: npt.NDArray[np.int64]) -> Array:
+def lagged(v: Array, a: Array, at: Whole) -> Array:
     """Return ``h_k = a h_{k-1} + (1 - a) v_k``, ``h_{-1} = v_0``, at some samples, shape (len(at), a by channels)."""
     from scipy.signal import lfilter
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.errors import ConfigError
 from ...core.lti import gain
 from ...lifting import Lifting
@@ -22,8 +22,6 @@ from .gaps import with_gaps
 from .reduction import Filters, reduced
 from .regression import Design, Readout, Recordings, is_less
 from .settings import EstimatorSettings
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

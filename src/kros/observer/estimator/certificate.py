@@ -16,8 +16,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import hinf_norm
@@ -31,7 +31,6 @@ from ..sensor_gains import noise_response
 from .channels import CONSTANT, without_limits
 from .regression import Readout
 
-Array = npt.NDArray[np.float64]
 ASSUMPTIONS = (
     "the machine and the observer have the same inputs",
     "machine and observer lift with the same parameters",

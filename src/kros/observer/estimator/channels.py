@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, ArrayLike
 from ...lifting import Lifting
 from .settings import EstimatorSettings
 
-Array = npt.NDArray[np.float64]
 Ranges = Mapping[str, tuple[float, float]]  # of measured states and inputs in training, in the recordings' units
 Group = tuple[tuple[int, float], ...]  # channels that go on together, a measurement first, and how far each
 _QUADRATURE = {"sin": "cos", "cos": "sin"}
@@ -82,7 +81,7 @@ class Channels:
         before = np.concatenate([v[:1], v[:-1]])
         return v @ N.T - before @ E @ E.T
 
-    def signals(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+    def signals(self, y: Array, u: Array, parameters: Mapping[str, ArrayLike]) -> Array:
         """Return the channels of measurements (..., q) and inputs (..., m), shape (..., channels)."""
         x = np.zeros((*y.shape[:-1], self.lifting.n_states))
         x[..., list(self.measured)] = y

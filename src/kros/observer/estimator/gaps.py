@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
-from ...core.arrays import Parameters
+from ...core.arrays import Array, Flags, Parameters, Whole
 from ...core.rounding import TINY
 from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
@@ -16,8 +15,6 @@ from ..simulate import Course
 from .regression import Recordings, is_less
 from .settings import EstimatorSettings
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 _NEVER = 1e12  # samples: an age that no gap has
 _ROWS = 1000  # samples at a time
 
@@ -114,7 +111,7 @@ def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Param
     return np.concatenate([course.take(y[k : k + _ROWS], u[k : k + _ROWS]).estimates[..., some] for k in starts])
 
 
-def earliest(errors: Array, half: Array, margin: float) -> npt.NDArray[np.int64]:
+def earliest(errors: Array, half: Array, margin: float) -> Whole:
     """Return for every state of errors (c, batch, n) the best of least half within paired standard errors."""
     mean = errors.mean(axis=1)
     apart = errors - np.take_along_axis(errors, np.argmin(mean, axis=0)[None, None], axis=0)

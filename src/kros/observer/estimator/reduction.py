@@ -11,15 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array
 from ...core.norms import gramian_root
 from ...core.rounding import EPS
 from ...loops import recursion
 from .channels import Channels
 from .regression import Readout
 
-Array = npt.NDArray[np.float64]
 _EPISODES = 8
 
 

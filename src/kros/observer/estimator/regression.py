@@ -13,11 +13,11 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array, Flags, Whole
 from ...core.errors import DataError
 from ...core.linalg import qr_triangle
 from ...core.rounding import EPS, ROUNDING
@@ -27,7 +27,6 @@ from .bank import Bank
 from .channels import Channels
 from .settings import EstimatorSettings
 
-Array = npt.NDArray[np.float64]
 T = TypeVar("T", bound=Hashable)
 Read = Callable[[EpisodeKey], EpisodeBatch]
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
@@ -111,7 +110,7 @@ class Recordings:
         return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
 
 
-def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[npt.NDArray[np.int64], Array]]:
+def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[Whole, Array]]:
     """Yield which samples of every episode are about so many rows, and for how many each stands.
 
     Each has a sample after it. At the start they are denser than later.
@@ -256,7 +255,7 @@ class Moments:
         power = np.diagonal(total, axis1=1, axis2=2)[:, r:-1]
         return cls(whitening, tuple(sums), total[:, :r, :r], total[:, :r, r:-1], power)
 
-    def of_groups(self, what: str) -> npt.NDArray[Any]:
+    def of_groups(self, what: str) -> AnyArray:
         """Return fold, condition or part of every group."""
         return np.array([getattr(group, what) for group in self.groups])
 
@@ -280,7 +279,7 @@ class Moments:
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
-    def known(self, group: Group) -> npt.NDArray[np.bool_]:
+    def known(self, group: Group) -> Flags:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
         alike = self.of_groups("condition") == group.condition
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part

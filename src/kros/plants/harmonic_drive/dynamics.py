@@ -17,14 +17,11 @@ from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from .parameters import COUNT_RAD, GEAR_RATIO, SAMPLE_PERIOD_S, VELOCITY_POLE, DriveParameters, Gains
-
-Array = npt.NDArray[Any]
 
 SUBSTEPS = 2
 SUBSTEP_S = SAMPLE_PERIOD_S / SUBSTEPS
@@ -35,7 +32,7 @@ BLOCK_SAMPLES = 32  # recorded time-major, then turned into one row per trajecto
 _SIGNALS = (0, 1, MEASURED + 1 + CURRENT)  # recorded rows of position, velocity and current
 
 
-def transition(p: DriveParameters, loaded: Array) -> Array:
+def transition(p: DriveParameters, loaded: AnyArray) -> AnyArray:
     """Return the exact map over a substep, shape (n, 5, 7): from z to the next [s, w, w_l, i] and the step of q."""
     from scipy.linalg import expm
 
@@ -57,7 +54,7 @@ def transition(p: DriveParameters, loaded: Array) -> Array:
 class Physics:
     """State of a batch of trajectories and the code that moves it on by one sample."""
 
-    def __init__(self, p: DriveParameters, loaded: Array, q0: Array) -> None:
+    def __init__(self, p: DriveParameters, loaded: AnyArray, q0: AnyArray) -> None:
         n = len(p)
         self.p, self.moment = p, loaded * p.load_moment
         self.M = np.ascontiguousarray(np.moveaxis(transition(p, loaded), 0, -1))
@@ -80,7 +77,7 @@ class Physics:
             z[:4] = moved[:4]
             q += moved[4]
 
-    def disturbance(self, q: Array) -> Array:
+    def disturbance(self, q: AnyArray) -> AnyArray:
         """Return i_d of (34), a fraction of full scale: Im sum_h a_h exp(j phi_h) exp(j h r q), by Horner's rule."""
         angle = q * GEAR_RATIO
         e = np.cos(angle) + 1j * np.sin(angle)
@@ -90,7 +87,7 @@ class Physics:
         return total.imag
 
 
-def load_torque(p: DriveParameters, recorded: Array) -> Array:
+def load_torque(p: DriveParameters, recorded: AnyArray) -> AnyArray:
     """Torque that loads take from the flange, inertia and gravity, N m, shape (n_samples, n)."""
     q, z = recorded[MEASURED], recorded[MEASURED + 1 :]
     gravity = p.load_moment * np.sin(q - z[TWIST])
@@ -102,13 +99,13 @@ def load_torque(p: DriveParameters, recorded: Array) -> Array:
 class SimulatedSignals:
     """What a simulation leaves behind, one row per trajectory."""
 
-    states: Array  # shape (n, 3, n_samples): quantised position, its filtered difference, current without noise
-    velocity: Array  # shape (n, 1, n_samples), rad/s; true velocity of the motor
-    load_torque: Array  # shape (n_loaded, n_samples), float32, fraction of full-scale current; taken from the flange
+    states: AnyArray  # shape (n, 3, n_samples): quantised position, its filtered difference, current without noise
+    velocity: AnyArray  # shape (n, 1, n_samples), rad/s; true velocity of the motor
+    load_torque: AnyArray  # shape (n_loaded, n_samples), float32, fraction of full-scale current; taken from the flange
 
 
 def simulate(
-    p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains
+    p: DriveParameters, loaded: AnyArray, reference: AnyArray, targets: tuple[AnyArray, AnyArray], gains: Gains
 ) -> SimulatedSignals:
     """Simulate all trajectories; `targets` are position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
     n, n_samples, is_loaded = len(p), targets[0].shape[1], np.flatnonzero(loaded)
@@ -142,7 +139,7 @@ class _Controller:
         self.p[:] = np.rint(physics.q / COUNT_RAD) * COUNT_RAD
         self._integral = physics.z[COMMAND].copy()
 
-    def sample(self, rp: Array, rv: Array) -> None:
+    def sample(self, rp: AnyArray, rv: AnyArray) -> None:
         """Measure, and set the command for the coming sampling period."""
         gains, u = self.gains, self.physics.z[COMMAND]
         position = np.rint(self.physics.q * (1.0 / COUNT_RAD)) * COUNT_RAD

@@ -15,9 +15,8 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from ...core.arrays import Array
 
 GEAR_RATIO = 100
 SAMPLE_PERIOD_S = 1e-3

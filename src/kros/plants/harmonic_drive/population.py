@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.errors import ConfigError, DataError
 from ...core.settings import member
 from ...data import prepare
@@ -31,8 +31,6 @@ from .parameters import (
     Loop,
 )
 from .reference import episode_reference
-
-Array = npt.NDArray[Any]
 
 CONDITIONS = ("noload", "load")
 CHANNELS = (
@@ -59,14 +57,14 @@ class Truth:
     loop: Loop
     gains: Gains
     load_rows: Mapping[EpisodeKey, int]  # row of `load_signals` of each loaded episode
-    load_signals: Array  # shape (n_loaded, n_samples), float32, in step with the prepared episodes
+    load_signals: AnyArray  # shape (n_loaded, n_samples), float32, in step with the prepared episodes
 
     @property
-    def phase_rad(self) -> Array:
+    def phase_rad(self) -> AnyArray:
         """Phase `phi1` of (34), shape (n_units,), rad, in [0, 2 pi)."""
         return self.parameters.phase_rad[:, 0]
 
-    def load_torque(self, key: EpisodeKey) -> Array:
+    def load_torque(self, key: EpisodeKey) -> AnyArray:
         """Return the torque that the load takes from the flange in an episode, inertia and gravity, (n_samples,)."""
         if key not in self.load_rows:
             raise DataError(f"Load torque of {key}: only the {len(self.load_rows)} loaded episodes have one.")
@@ -139,7 +137,7 @@ class HarmonicDrivePopulation(BatchSettings):
         }
         return ripple | {"phase_rad": rng.uniform(0.0, 2 * np.pi, len(RIPPLE))}
 
-    def _disturb(self, states: Array, keys: tuple[EpisodeKey, ...]) -> None:
+    def _disturb(self, states: AnyArray, keys: tuple[EpisodeKey, ...]) -> None:
         """Add what the recording adds: an offset of the position in each episode, noise on the current."""
         for row, key in enumerate(keys):
             rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))

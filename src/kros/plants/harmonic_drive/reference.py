@@ -7,11 +7,9 @@ backward almost all the time.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Flags
 from ...core.errors import ConfigError
-
-Array = npt.NDArray[np.float64]
 
 REFERENCE_STREAM = 0  # first word of the spawn key
 MAX_SPEED = np.pi  # rad/s: 0.5 rev/s at the output
@@ -85,7 +83,7 @@ def _candidates(rng: np.random.Generator, n_moves: int, shortest: float) -> Arra
     return drawn
 
 
-def _fits(drawn: Array, n_samples: int, period_s: float) -> npt.NDArray[np.bool_]:
+def _fits(drawn: Array, n_samples: int, period_s: float) -> Flags:
     """Tell which candidates fill the episode without overrunning it and hold full speed in both directions."""
     total = _durations(drawn, period_s).sum(axis=1) + SETTLE_SAMPLES
     moves = np.diff(drawn, axis=1) / (MAX_SPEED * period_s)

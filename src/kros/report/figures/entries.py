@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ...core.arrays import AnyArray
 from ...identify import ModelSet
 from ...uncertainty import Form
 from ...uncertainty.unit_residuals import UnitResiduals
-from ..canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
+from ..canvas import Axes, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
 from ..names import model_label, shorten, words
 from ..theme import DRAWING, Tone
 
@@ -80,7 +81,7 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
     label_below(block[-1])
 
 
-def _mark_unit(axes: Axes, residuals: UnitResiduals, levels: Array, alarm: str | None) -> None:
+def _mark_unit(axes: Axes, residuals: UnitResiduals, levels: AnyArray, alarm: str | None) -> None:
     """Draw the unit that stands out in red."""
     if alarm in residuals.unit_ids:
         line = levels[residuals.unit_ids.index(str(alarm))]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.arrays import AnyArray
 from ...core.errors import ConfigError
 from ...data import EpisodeBatch
 from ...data.population import Channel, Role
@@ -16,7 +17,7 @@ from ...evaluate.errors import error_spectrum
 from ...evaluate.sensor import as_shown
 from ...identify.identified import IdentifiedModels
 from ...observer import run_observer
-from ..canvas import Array, Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin
+from ..canvas import Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin
 from ..names import (
     Look,
     best_models,
@@ -63,7 +64,7 @@ class Block:
 
     title: str
     shown: Shown
-    lines: Mapping[str, tuple[Array, Look]]  # values, shape (n_samples, n), by label
+    lines: Mapping[str, tuple[AnyArray, Look]]  # values, shape (n_samples, n), by label
     states: Sequence[int]
 
 
@@ -166,13 +167,13 @@ def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, win
         row[3].axvspan(*signals.band_hz, color=Tone.GRID.light, lw=0, zorder=0.5)
 
 
-def _inside(values: Array, recorded: Array) -> Array:
+def _inside(values: AnyArray, recorded: AnyArray) -> AnyArray:
     """Return values; those outside the range of the recorded signal with a margin become NaN, which ends a line."""
     room = max(float(np.ptp(recorded)), np.finfo(float).tiny) / 2
     return np.where((values >= recorded.min() - room) & (values <= recorded.max() + room), values, np.nan)
 
 
-def draw_lines(axes: Axes, time_s: Array, lines: Mapping[str, tuple[Array, Look]], width: float = 1.0) -> None:
+def draw_lines(axes: Axes, time_s: AnyArray, lines: Mapping[str, tuple[AnyArray, Look]], width: float = 1.0) -> None:
     """Draw lines over time, later ones in front."""
     for label, (values, look) in lines.items():
         x, y = thin(time_s, values)
@@ -211,7 +212,7 @@ def steady_window(signals: Signals, shown: Shown) -> slice:
     return slice(min(int(first), samples - size), min(int(first), samples - size) + size)
 
 
-def steady_stretches(speed: Array) -> list[tuple[int, int]]:
+def steady_stretches(speed: AnyArray) -> list[tuple[int, int]]:
     """Return all stretches within 2 % of the highest speed, each of one direction."""
     top = float(np.max(np.abs(speed), initial=0.0))
     stretches: list[tuple[int, int]] = []

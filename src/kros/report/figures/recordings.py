@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core.arrays import AnyArray
 from ...core.errors import ConfigError
 from ...data.population import Population, Role
 from ...data.recording import some
 from ...evaluate.errors import error_spectrum
 from ...identify import PhaseCalibration
-from ..canvas import Array, Figure, grid, label_below, legend, logarithmic, name_units, note, units_axis
+from ..canvas import Figure, grid, label_below, legend, logarithmic, name_units, note, units_axis
 from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
@@ -83,7 +84,7 @@ def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
     return figure, text + f"which is {spec.ratio:g} times the speed, and its multiples."
 
 
-def _tracking(run: RunFolder, shown: Shown) -> tuple[Array, Array, float]:
+def _tracking(run: RunFolder, shown: Shown) -> tuple[AnyArray, AnyArray, float]:
     """Return frequencies, density and the disturbance's frequency."""
     spec, names = run.calibration.spec, [c.name for c in run.channels]
     values = np.hstack([shown.states, shown.inputs]).astype(float)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ...core.arrays import AnyArray
 from ...core.errors import ConfigError
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, residual, sigma_max
@@ -13,7 +14,6 @@ from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
 from ...uncertainty.unit_residuals import UnitResiduals
 from ...uncertainty.weights.cover import Cover
 from ..canvas import (
-    Array,
     Axes,
     Figure,
     decibel,
@@ -61,7 +61,7 @@ def forms(run: RunFolder) -> tuple[Figure, str]:
     return figure, text
 
 
-def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Array, Array]]:
+def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[AnyArray, AnyArray]]:
     """Return frequencies and bounds of the output forms as published."""
     freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.frequencies)]
     response = models.scaled_responses(freqs, model.unit_ids)
@@ -133,7 +133,7 @@ def in_gauge(cover: Cover, other: Cover) -> Cover:
     return Cover(cover.left / scale, cover.right * scale)
 
 
-def _side(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: Sequence[str]) -> None:
+def _side(axes: Axes, freqs_hz: AnyArray, magnitudes: AnyArray, cover: AnyArray, names: Sequence[str]) -> None:
     """Draw the entries of one weight, each with its name."""
     columns = range(magnitudes.shape[1])
     labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]

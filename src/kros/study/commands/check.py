@@ -12,8 +12,8 @@ from urllib.parse import quote
 from xml.etree import ElementTree
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Flags
 from ...core.artifacts import plain
 from ...core.errors import ConfigError, DataError
 from ...core.work import Executor
@@ -134,7 +134,7 @@ def _reasons(row: dict[str, Any]) -> list[str]:
 
 
 Rows = list[dict[str, Any]]
-Judged = list[tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]]  # innovations, and which samples are judged
+Judged = list[tuple[Array, Flags]]  # innovations, and which samples are judged
 
 
 def check_units(run: Path, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from ...core.arrays import Bits
+from ...core.arrays import Array, Bits
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import read_toml
@@ -39,7 +38,6 @@ from ..engine.store import Store, open_finished
 from ..stages.learning import ARRAYS
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
 Texts = dict[str, str]  # by unit
 # Episode, first sample, columns of estimates and of the tracked parameter, bits: of an episode or a block of it

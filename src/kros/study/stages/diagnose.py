@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.errors import KrosError
 from ...identify import Factor, ModelSet
 from ...identify.bootstrap import bootstrap_edmd, episode_weights
@@ -79,7 +79,7 @@ def _noise(context: Context, kind: str, uncertain: UncertainModel) -> Callable[[
     rows = np.zeros(used.shape, dtype=int)
     rows[used] = np.concatenate(places)
 
-    def by_unit(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def by_unit(values: AnyArray) -> AnyArray:
         values = values[rows]
         values[~used] = 0
         return values

@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any, get_args
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array
 from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
 from ...data.population import EpisodeKey
@@ -25,7 +25,6 @@ from ..engine.context import Context
 from .load import run_load
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 Pieces = dict[tuple[str, ...], Callable[[], Any]]  # work by the names of its results
 
 
@@ -161,7 +160,7 @@ def load_observers(context: Context) -> dict[str, Observer]:
 
 def _arrays(
     episodes: HeldOut, estimates: Mapping[str, Outcome], free_runs: Mapping[str, Outcome]
-) -> dict[str, npt.NDArray[Any]]:
+) -> dict[str, AnyArray]:
     """Collect the trajectories that figures need, in single precision."""
     arrays: dict[str, Array] = {}
     for number, i in enumerate(episodes.shown):

@@ -14,8 +14,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import Array, Flags
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
@@ -29,7 +29,6 @@ from ...observer import EstimatorSettings, Observer, run_observer
 from ..engine.context import Context
 
 log = logging.getLogger(__name__)
-Array = npt.NDArray[np.float64]
 LOAD = "load"
 
 
@@ -159,7 +158,7 @@ class LoadTrial:
         return self.states.index(TRIAL.angle), self.states.index(TRIAL.current)
 
     @property
-    def loaded(self) -> npt.NDArray[np.bool_]:
+    def loaded(self) -> Flags:
         """Which test episodes have the load."""
         return np.array([k.condition == TRIAL.condition for k in self.test.keys])
 

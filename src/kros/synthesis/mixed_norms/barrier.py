@@ -27,14 +27,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
-
-Array = npt.NDArray[Any]
 
 _SHRINK, _CENTRED, _STEPS = 0.3, 1.0, 400  # of mu once the decrement is below the second, and Newton steps at most
 
@@ -52,14 +49,14 @@ class Ending(str, Enum):
 class Block:
     """Matrix inequalities of one size: constant (k, d, d) and coefficients (n, k, d, d), all symmetric, k of them."""
 
-    constant: Array
-    basis: Array
+    constant: AnyArray
+    basis: AnyArray
 
-    def at(self, x: Array) -> Array:
+    def at(self, x: AnyArray) -> AnyArray:
         """Value of the matrices, shape (k, d, d)."""
         return self.constant + self.along(x)
 
-    def along(self, x: Array) -> Array:
+    def along(self, x: AnyArray) -> AnyArray:
         """``sum_i x_i M_i``."""
         return np.tensordot(x, self.basis, 1)
 
@@ -68,16 +65,16 @@ class Block:
 class Outcome:
     """Last point that satisfies all inequalities, if any, its value, a lower bound of the optimum, and how it ended."""
 
-    x: Array | None
+    x: AnyArray | None
     value: float
     lower: float
     ending: Ending
 
 
 def minimise(
-    c: Array,
+    c: AnyArray,
     blocks: Sequence[Block],
-    start: Array,
+    start: AnyArray,
     *,
     rtol: float = 1e-5,
     time_limit_s: float = 20.0,
@@ -93,7 +90,7 @@ def minimise(
     return _follow(programme, start, rtol)
 
 
-def _find_feasible(programme: _Programme, start: Array) -> Outcome:
+def _find_feasible(programme: _Programme, start: AnyArray) -> Outcome:
     """Minimise t subject to ``F_k + t I >= 0``, ``t >= -1``, until t is negative enough."""
     n, goal = len(start), np.append(np.zeros(len(start)), 1.0)
     lifted = [Block(np.ones((1, 1, 1)), goal[:, None, None, None])]
@@ -111,7 +108,7 @@ def _find_feasible(programme: _Programme, start: Array) -> Outcome:
     return Outcome(None, np.inf, -np.inf, Ending.INFEASIBLE if outcome.lower > 0 else ending)
 
 
-def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -np.inf) -> Outcome:
+def _follow(programme: _Programme, x: AnyArray, rtol: float, stop_below: float = -np.inf) -> Outcome:
     """Follow the central path from a point inside; with `stop_below` to a centred point clearly below it."""
     size = programme.size
     mu, lower, ending = max(abs(programme.value(x)), 1e-3) / size * 10, -np.inf, Ending.STALLED
@@ -147,9 +144,9 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
 class _Programme:
     """``min c'x`` subject to the blocks and ``|x_i| <= box_i``, until a time of the performance counter."""
 
-    c: Array
+    c: AnyArray
     blocks: Sequence[Block]
-    box: Array
+    box: AnyArray
     end: float
 
     @property
@@ -157,16 +154,16 @@ class _Programme:
         """Number of logarithms in the barrier."""
         return sum(b.constant.shape[0] * b.constant.shape[1] for b in self.blocks) + 2 * len(self.c)
 
-    def value(self, x: Array) -> float:
+    def value(self, x: AnyArray) -> float:
         """Objective."""
         return float(self.c @ x)
 
-    def holds(self, x: Array) -> bool:
+    def holds(self, x: AnyArray) -> bool:
         """Whether a point satisfies all inequalities."""
         inside = bool((np.abs(x) < self.box).all())
         return inside and all(np.linalg.eigvalsh(b.at(x)).min(initial=1.0) > 0 for b in self.blocks)
 
-    def derivatives(self, x: Array) -> tuple[Array, Array, list[Array]]:
+    def derivatives(self, x: AnyArray) -> tuple[AnyArray, AnyArray, list[AnyArray]]:
         """Gradient ``-tr D_i``, Hessian ``tr D_i D_j`` with ``D_i = R M_i R'``, and the inverse Cholesky factors R."""
         above, below = 1 / (self.box - x), 1 / (self.box + x)
         gradient, hessian, roots = above - below, np.diag(above**2 + below**2), []
@@ -180,7 +177,7 @@ class _Programme:
             roots.append(root)
         return gradient, hessian, roots
 
-    def spectrum(self, roots: Sequence[Array], x: Array, direction: Array) -> Array:
+    def spectrum(self, roots: Sequence[AnyArray], x: AnyArray, direction: AnyArray) -> AnyArray:
         """Eigenvalues of ``F^-1/2 dF F^-1/2`` of all blocks and of the box."""
         parts = [direction / (self.box + x), -direction / (self.box - x)]
         for block, root in zip(self.blocks, roots, strict=True):
@@ -189,7 +186,7 @@ class _Programme:
         return np.concatenate(parts)
 
 
-def _solve(hessian: Array, gradient: Array) -> Array:
+def _solve(hessian: AnyArray, gradient: AnyArray) -> AnyArray:
     """Newton direction in units in which the Hessian has a unit diagonal, with one step of refinement."""
     scale = 1 / np.sqrt(np.diag(hessian))
     scaled = hessian * scale[:, None] * scale + 100 * EPS * np.eye(len(hessian))
@@ -199,7 +196,7 @@ def _solve(hessian: Array, gradient: Array) -> Array:
     return direction * scale
 
 
-def _line_search(slope: float, eigenvalues: Array) -> float:
+def _line_search(slope: float, eigenvalues: AnyArray) -> float:
     """Minimise ``slope t - sum log(1 + t eigenvalue)`` over the step t."""
     from scipy.optimize import minimize_scalar
 

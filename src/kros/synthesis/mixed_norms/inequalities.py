@@ -28,11 +28,10 @@ X, Y, A_n, B_n, C_n, D_n, Z : the variables
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.linalg import balancing
 from ...core.lti import StateSpace
 from ...core.norms import gramian, h2_norm
@@ -41,8 +40,7 @@ from ..generalized_plant import GeneralizedPlant
 from ..riccati.h2 import h2
 from .barrier import Block
 
-Array = npt.NDArray[Any]
-Values = dict[str, Array]
+Values = dict[str, AnyArray]
 
 _MARGIN = 1e-3  # least eigenvalue of the scaled Lyapunov matrices, which keeps I - Y X regular
 _KNOWN = 1e-3  # error, in a state's standard deviations, that stands for that of a state known exactly
@@ -54,9 +52,9 @@ class Balanced:
 
     plant: GeneralizedPlant
     size: float
-    spread: Array
-    controls: Array
-    measurements: Array
+    spread: AnyArray
+    controls: AnyArray
+    measurements: AnyArray
 
     def controller(self, K: StateSpace) -> StateSpace:
         """Return the controller of the original plant."""
@@ -115,7 +113,7 @@ class MixedInequalities:
         """Number of scalar variables."""
         return sum(_count(*shape) for shape in self.shapes.values())
 
-    def values(self, x: Array) -> Values:
+    def values(self, x: AnyArray) -> Values:
         """Matrices from scalar variables, shape (..., n); the leading axes stay."""
         matrices, position = {}, 0
         for name, (rows, columns, symmetric) in self.shapes.items():
@@ -131,7 +129,7 @@ class MixedInequalities:
             matrices[name] = matrix
         return matrices
 
-    def start(self) -> Array:
+    def start(self) -> AnyArray:
         """Variables of no correction, with the Lyapunov matrices that are expected."""
         values = {name: np.zeros(shape[:2]) for name, shape in self.shapes.items()}
         values["X"] = values["Y"] = 2 * np.diag(self.balanced.spread)
@@ -142,7 +140,7 @@ class MixedInequalities:
         ]
         return np.concatenate(parts)
 
-    def objective(self) -> Array:
+    def objective(self) -> AnyArray:
         """Coefficients of tr Z."""
         return np.trace(self.values(np.eye(self.size))["Z"], axis1=-2, axis2=-1)
 
@@ -151,7 +149,7 @@ class MixedInequalities:
         constants, whole = self._matrices(np.zeros((1, self.size))), self._matrices(np.eye(self.size))
         return [Block(c, (m - c)[:, None]) for c, m in zip(constants, whole, strict=True)]
 
-    def _matrices(self, x: Array) -> list[Array]:
+    def _matrices(self, x: AnyArray) -> list[AnyArray]:
         """Matrices of all inequalities at the points x, shape (k, n); each (k, d, d)."""
         p, v = self.balanced.plant, self.values(x)
         n, eye = p.sizes[0], np.eye(p.sizes[0])
@@ -180,7 +178,7 @@ class MixedInequalities:
                 )
         return blocks
 
-    def _channel(self, channel: int, v: Values, scale: Array) -> tuple[Array, Array, Array]:
+    def _channel(self, channel: int, v: Values, scale: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
         """B~, C~, D~ of one channel, scaled; disturbances without effect on it are left out."""
         p = self.balanced.plant
         part = p.channel(p.rows(channel), p.columns(channel))
@@ -190,7 +188,7 @@ class MixedInequalities:
         C = np.concatenate([part.C1 @ v["X"] + part.D12 @ v["Cn"], part.C1 + part.D12 @ v["Dn"] @ part.C2], axis=-1)
         return scale[:, None] * B, C * scale, D11 + part.D12 @ v["Dn"] @ D21
 
-    def controller(self, x: Array) -> StateSpace:
+    def controller(self, x: AnyArray) -> StateSpace:
         """Controller of the plant before balancing (for D22 = 0) from the variables; ``V U = I - Y X``."""
         p, v = self.balanced.plant, self.values(x)
         X, Y, Bn, Cn, Dn = (v[name] for name in ("X", "Y", "Bn", "Cn", "Dn"))
@@ -208,7 +206,7 @@ def _count(rows: int, columns: int, symmetric: bool) -> int:
     return rows * (rows + 1) // 2 if symmetric else rows * columns
 
 
-def _blocks(rows: list[list[Array]]) -> Array:
+def _blocks(rows: list[list[AnyArray]]) -> AnyArray:
     """Block matrix of stacks of matrices, whose leading axes are broadcast."""
     batch = np.broadcast_shapes(*(m.shape[:-2] for row in rows for m in row))
     wide = [np.concatenate([np.broadcast_to(m, (*batch, *m.shape[-2:])) for m in row], axis=-1) for row in rows]

@@ -9,17 +9,15 @@ F, H, P, Q : ``v = F y + H w``,  ``z = P y + Q w``
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.errors import DimensionError
 from ...core.lti import StateSpace, block_diagonal
 from ...core.rounding import SINGULAR
 
-Array = npt.NDArray[Any]
-Sum = Mapping[str, Array]
+Sum = Mapping[str, AnyArray]
 
 
 def interconnect(
@@ -42,7 +40,7 @@ def interconnect(
     )
 
 
-def _matrix(rows: Mapping[str, Sum], heights: Mapping[str, int], widths: Mapping[str, int]) -> Array:
+def _matrix(rows: Mapping[str, Sum], heights: Mapping[str, int], widths: Mapping[str, int]) -> AnyArray:
     """Stack the matrices of all sums, zero where a sum does not name a source."""
     if not heights or not widths:
         return np.zeros((sum(heights.values()), sum(widths.values())))

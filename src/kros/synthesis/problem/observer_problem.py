@@ -23,11 +23,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, ArrayLike
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from ...identify.model_set import ModelSet
     from ...uncertainty.model import UncertainModel
 
-Array = npt.NDArray[Any]
 _WEIGHTS = ("W_L", "W_R", "W_u", "remainder_left", "remainder_right")
 
 
@@ -68,12 +67,12 @@ class ObserverProblem:
     """
 
     nominal: StateSpace  # only A (n, n), B (n, m) and dt are used, the state being the full lifted state
-    C: Array  # (q, n), selects the measured outputs from the lifted state
+    C: AnyArray  # (q, n), selects the measured outputs from the lifted state
     W_L: StateSpace  # left weight of ``E = W_L Delta W_R`` on scaled signals, stable; as many outputs as E has rows
     W_R: StateSpace  # right weight, stable; as many inputs as E has columns
-    input_scale: Array  # (m,), physical size of each input
-    output_scale: Array  # (n,), physical size of each (lifted) state
-    noise: Array  # (q,), standard deviation of the white measurement noise per sample, in the units of y
+    input_scale: AnyArray  # (m,), physical size of each input
+    output_scale: AnyArray  # (n,), physical size of each (lifted) state
+    noise: AnyArray  # (q,), standard deviation of the white measurement noise per sample, in the units of y
     n_original: int | None = (
         None  # the first states are the original ones, whose errors over `output_scale` count; default all
     )
@@ -81,7 +80,7 @@ class ObserverProblem:
     remainder_left: StateSpace | None = None  # (n, n), left weight of the additive remainder on scaled states
     remainder_right: StateSpace | None = None  # (m, m), right weight of it on scaled inputs
     injection: Injection = Injection.STATE  # where the correction enters
-    process_noise: Array | None = None  # (n,), standard deviation of white noise on every state per sample
+    process_noise: AnyArray | None = None  # (n,), standard deviation of white noise on every state per sample
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE  # of the uncertainty
 
     def __post_init__(self) -> None:
@@ -128,7 +127,7 @@ class ObserverProblem:
                 self._require(weight.dt == dt, f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s")
 
     @classmethod
-    def from_uncertain(cls, models: ModelSet, uncertain: UncertainModel, noise: npt.ArrayLike) -> ObserverProblem:
+    def from_uncertain(cls, models: ModelSet, uncertain: UncertainModel, noise: ArrayLike) -> ObserverProblem:
         """Return the problem of the nominal unit and the set around it, remainder included.
 
         Parameters
@@ -181,7 +180,7 @@ class ObserverProblem:
         return self.W_u if self.W_u is not None else gain(np.eye(self.nominal.n_inputs), self.nominal.dt)
 
     @cached_property
-    def scaled(self) -> tuple[Array, Array, Array, Array]:
+    def scaled(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
         """A, B, C and the selection W_p of the original states, scaled; the measurement noise has unit covariance."""
         x, u = self.output_scale, self.input_scale
         A, B = self.nominal.A * x / x[:, None], self.nominal.B * u / x[:, None]
@@ -204,7 +203,7 @@ class ObserverProblem:
         return self.location.N(self.W_R, self.scaled_model, self.W_L)
 
     @property
-    def injection_matrix(self) -> Array:
+    def injection_matrix(self) -> AnyArray:
         """J in scaled coordinates: the correction enters through the inputs or on the state itself."""
         A, B, _, _ = self.scaled
         return B if self.injection is Injection.INPUT else np.eye(len(A))
@@ -250,7 +249,7 @@ class ObserverProblem:
         return size
 
     @property
-    def scaled_process_noise(self) -> Array:
+    def scaled_process_noise(self) -> AnyArray:
         """Standard deviation of the process noise over `output_scale`, shape (n,)."""
         return self.process_noise / self.output_scale
 
@@ -297,7 +296,7 @@ class ObserverProblem:
         return interconnect({"plant": plant, "F": filters}, wires, inputs, outputs)
 
     @property
-    def _scales(self) -> tuple[Array, Array]:
+    def _scales(self) -> tuple[AnyArray, AnyArray]:
         """Sizes of the correction and of the measurements."""
         return self.input_scale if self.injection is Injection.INPUT else self.output_scale, self.noise
 

@@ -25,17 +25,14 @@ s : scaled input;  xi : what the observer's loop can see of the error;  e : erro
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.lti import StateSpace, block_diagonal, gain
 from ..generalized_plant import GeneralizedPlant, split
 from .interconnect import interconnect
 from .observer_problem import ObserverProblem
-
-Array = npt.NDArray[Any]
 
 # In matrix inequalities: share of the measured channel's range, weight of the scaled correction.
 _LEAST_NOISE, _PENALTY = 1e-3, 3e-2
@@ -54,7 +51,7 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     drive = {"u": -J} | ({"W_L": B} if location.at_input else {})
     own = {"W_L": eye(problem.W_L.n_outputs)} if location.inverse else {}
     seen = {"W_u": eye(m)} if location.sees_input else {"plant": eye(n)}
-    wires: dict[str, dict[str, Array]] = {"W_u": {"w1": eye(m)}, "W_L": {"w2": eye(inputs["w2"])}}
+    wires: dict[str, dict[str, AnyArray]] = {"W_u": {"w1": eye(m)}, "W_L": {"w2": eye(inputs["w2"])}}
     if not location.sees_input:
         blocks["plant"] = whole
         wires["plant"] = {"W_u": B} | ({"W_L": B} if location.inverse and location.at_input else {})

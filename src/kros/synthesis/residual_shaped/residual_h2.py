@@ -16,11 +16,10 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Array, Index
 from ...core.errors import SynthesisError
 from ...core.linalg import balancing
 from ...core.lti import StateSpace, gain
@@ -30,9 +29,6 @@ from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.kalman import kalman, predictor_bound
 from .shaping_filter import Basis, circle_weights, shaping_filter
 
-Array = npt.NDArray[np.float64]
-Spectra = npt.NDArray[Any]
-
 
 @dataclass(frozen=True, eq=False)
 class ResidualProblem:
@@ -40,7 +36,7 @@ class ResidualProblem:
 
     A: Array  # (n, n), error dynamics of the original states
     C: Array  # (q, n), selects the measured states
-    spectra: Spectra  # (unit, f, n, n), complex: cross spectral density of every unit's one-step residual
+    spectra: AnyArray  # (unit, f, n, n), complex: cross spectral density of every unit's one-step residual
     noise: Array  # (q,), standard deviation of the measurement noise
     scale: Array  # (n,), range of every state; norms are of errors in these units
     dt: float  # s
@@ -110,7 +106,7 @@ class _Scaled:
     A: Array
     C: Array
     noise: Array
-    spectra: Spectra
+    spectra: AnyArray
     basis: Basis
     dt: float
 
@@ -155,7 +151,7 @@ class _Scaled:
         )
 
     @property
-    def hidden(self) -> npt.NDArray[np.intp]:
+    def hidden(self) -> Index:
         """States that are not measured; all where none is hidden."""
         measured = np.any(self.C, axis=0)
         return np.flatnonzero(~measured) if not measured.all() else np.arange(len(self.A))

@@ -20,16 +20,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.rounding import ITERATED, ROUNDING
 
-Array = npt.NDArray[Any]
 _FLOOR = ROUNDING  # white noise of every channel, relative to the largest, which keeps the Gramian regular
 
 
@@ -42,7 +40,7 @@ class Basis:
     poles: tuple[float, ...] = (0.9, 0.97, 0.99, 0.997)
 
     @cached_property
-    def scalar(self) -> tuple[Array, Array]:
+    def scalar(self) -> tuple[AnyArray, AnyArray]:
         """Dynamics and input of the basis of one channel."""
         from scipy.linalg import block_diag
 
@@ -56,25 +54,25 @@ class Basis:
         """States a channel."""
         return self.delays + len(self.poles)
 
-    def response(self, z: Array) -> Array:
+    def response(self, z: AnyArray) -> AnyArray:
         """Return Z of one channel at points of the unit circle, shape (f, size)."""
         lags = np.sqrt(1 - np.array(self.poles) ** 2) / (z[:, None] - np.array(self.poles))
         return np.hstack([z[:, None] ** -np.arange(1, self.delays + 1), lags])
 
-    def system(self, n: int) -> tuple[Array, Array]:
+    def system(self, n: int) -> tuple[AnyArray, AnyArray]:
         """Return A_z and B_z for n channels, the channels of one delay or lag side by side."""
         (A, b), size = self.scalar, n * self.size
         return np.kron(A, np.eye(n)).reshape(size, size), np.kron(b[:, None], np.eye(n)).reshape(size, n)
 
 
-def circle_weights(f: int) -> Array:
+def circle_weights(f: int) -> AnyArray:
     """Return weights of the mean over the unit circle, for f equal steps from zero to Nyquist; they sum to one."""
     weight = np.full(f, 1.0 / (f - 1))
     weight[[0, -1]] /= 2
     return weight
 
 
-def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
+def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
     """Fit a shaping filter to a spectrum."""
     f, n = spectrum.shape[:2]
     weight = circle_weights(f)

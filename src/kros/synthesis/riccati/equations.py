@@ -9,20 +9,16 @@ F : state feedback, u = F x;  F0 : feedforward of the disturbance, u = F x + F0 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 from numpy.linalg import LinAlgError
 
+from ...core.arrays import AnyArray
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ITERATED, SINGULAR, TINY
 
-Array = npt.NDArray[Any]
 
-
-def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, method: str) -> Array:
+def solve_riccati(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray, dt: float, method: str) -> AnyArray:
     """Return the stabilising solution X of the algebraic Riccati equation."""
     from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov, solve_discrete_are
 
@@ -46,12 +42,12 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, m
     return X
 
 
-def discrete_gain(A: Array, B: Array, R: Array, S: Array, X: Array) -> Array:
+def discrete_gain(A: AnyArray, B: AnyArray, R: AnyArray, S: AnyArray, X: AnyArray) -> AnyArray:
     """Optimal discrete feedback ``F = -(R + B' X B)^-1 (B' X A + S')``."""
     return -np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
 
 
-def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> float:
+def _residual(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray, X: AnyArray) -> float:
     """Relative residual in the closed-loop (Joseph) form, which does not cancel; infinite for an unstable loop."""
     F = discrete_gain(A, B, R, S, X)
     closed = A + B @ F
@@ -63,7 +59,7 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
     return float(np.linalg.norm(closed.T @ X @ closed + cost - X)) / size
 
 
-def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
+def _doubling(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray) -> AnyArray | None:
     """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, sums of semidefinites."""
     try:
         RiS, RiB = np.linalg.solve(R, S.T), np.linalg.solve(R, B.T)
@@ -86,7 +82,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
     return None
 
 
-def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
+def absorb_feedthrough(K: StateSpace, D22: AnyArray) -> StateSpace:
     """Turn a controller for ``y - D22 u`` into one for ``y``."""
     if not np.any(D22):
         return K

@@ -21,12 +21,11 @@ K. Zhou, J. C. Doyle, K. Glover, *Robust and Optimal Control*, theorem 17.1 (pag
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import schur
 
+from ...core.arrays import AnyArray
 from ...core.errors import SynthesisError
 from ...core.linalg import balanced_size, balancing
 from ...core.lti import StateSpace
@@ -34,8 +33,6 @@ from ...core.norms import to_continuous
 from ...core.rounding import EPS, SINGULAR, TINY
 from ..generalized_plant import GeneralizedPlant, split
 from .equations import absorb_feedthrough, solve_riccati
-
-Array = npt.NDArray[Any]
 
 _DOUBT = float(np.sqrt(EPS))  # relative: conditions that hold or fail by less than this decide nothing
 
@@ -46,10 +43,10 @@ class Frame:
 
     given: GeneralizedPlant
     scaled: GeneralizedPlant  # the given plant for D22 = 0, its states scaled by powers of two
-    D22: Array
+    D22: AnyArray
     normal: GeneralizedPlant
-    left: Array
-    right: Array
+    left: AnyArray
+    right: AnyArray
 
     @classmethod
     def of(cls, given: GeneralizedPlant) -> Frame:
@@ -94,7 +91,9 @@ class Frame:
         return absorb_feedthrough(absorb_feedthrough(K, self.D22), self.given.D22)
 
 
-def _half(A: Array, B1: Array, B2: Array, C: Array, D1: Array, D2: Array, gamma: float) -> tuple[Array, Array]:
+def _half(
+    A: AnyArray, B1: AnyArray, B2: AnyArray, C: AnyArray, D1: AnyArray, D2: AnyArray, gamma: float
+) -> tuple[AnyArray, AnyArray]:
     """Stabilising solution X of ``x' = A x + B1 w + B2 u``, cost ``z'z - gamma^2 w'w``, and its feedback of (w, u)."""
     n, B, D = len(A), np.hstack([B1, B2]), np.hstack([D1, D2])
     R = D.T @ D - gamma**2 * np.diag(np.arange(D.shape[1]) < D1.shape[1])
@@ -110,13 +109,13 @@ def _half(A: Array, B1: Array, B2: Array, C: Array, D1: Array, D2: Array, gamma:
     return (X + X.T) / 2, -solved[:, :n] - solved[:, n:] @ X
 
 
-def _lowest(X: Array, size: float) -> float:
+def _lowest(X: AnyArray, size: float) -> float:
     """Lowest eigenvalue over the largest magnitude, which is at least a size."""
     values = np.linalg.eigvalsh(X)
     return float(values.min(initial=0.0) / max(float(np.abs(values).max(initial=0.0)), size, TINY))
 
 
-def _central(p: GeneralizedPlant, gamma: float, X: Array, F: Array, Y: Array, L: Array) -> StateSpace:
+def _central(p: GeneralizedPlant, gamma: float, X: AnyArray, F: AnyArray, Y: AnyArray, L: AnyArray) -> StateSpace:
     """Central controller of the normalised plant (Zhou, Doyle and Glover, theorem 17.1)."""
     _, n_w, n_u, n_z, n_y = p.sizes
     free_z, free_w = n_z - n_u, n_w - n_y
@@ -159,13 +158,13 @@ def _even(p: GeneralizedPlant) -> GeneralizedPlant:
     return p.transformed(x=(left, right))
 
 
-def _root(M: Array, size: float) -> Array:
+def _root(M: AnyArray, size: float) -> AnyArray:
     """Factor L of ``M = L L'``, in which directions without weight have a small one; the identity for rounding."""
     values, vectors = np.linalg.eigh(M)
     largest = float(values.max(initial=0.0))
     return vectors * np.sqrt(np.maximum(values, _DOUBT * largest)) if largest > _DOUBT * size else np.eye(len(M))
 
 
-def _size(A: Array, B: Array) -> float:
+def _size(A: AnyArray, B: AnyArray) -> float:
     """Size of a Riccati solution to expect for dynamics A and inputs or outputs B."""
     return float(np.linalg.norm(B)) ** 2 / max(float(np.linalg.norm(A)), TINY)

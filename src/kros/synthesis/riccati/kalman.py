@@ -9,11 +9,10 @@ Q, R : process and measurement noise covariance;  P : covariance of the one-step
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, ArrayLike
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm
@@ -22,10 +21,8 @@ from ..assumptions import require_detectable
 from ..result import Injection, Status, Synthesis
 from .equations import discrete_gain, solve_riccati
 
-Array = npt.NDArray[Any]
 
-
-def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLike, dt: float = 1.0) -> Synthesis:
+def kalman(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, dt: float = 1.0) -> Synthesis:
     """Return the steady-state Kalman predictor as a constant correction of the state.
 
     Parameters
@@ -96,13 +93,15 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     )
 
 
-def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, method: str) -> tuple[Array, Array]:
+def predictor(
+    A: AnyArray, C: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray, method: str
+) -> tuple[AnyArray, AnyArray]:
     """Gain and covariance of the one-step predictor for noise covariances Q, R and cross covariance S (n, q)."""
     P = solve_riccati(A.T, C.T, Q, R, S, 1.0, method)
     return -discrete_gain(A.T, C.T, R, S, P).T, P
 
 
-def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float:
+def predictor_bound(A: AnyArray, B: AnyArray, C: AnyArray, D: AnyArray, Z: AnyArray) -> float:
     """Return the least ``E |Z (x - x_hat)|^2`` for ``x+ = A x + B nu``, ``y = C x + D nu``; zero if unknown."""
     try:
         _, P = predictor(A, C, B @ B.T, D @ D.T, B @ D.T, "Lower bound")

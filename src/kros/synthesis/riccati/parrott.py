@@ -7,18 +7,14 @@ Riccati equations of `hinf_level` have stabilising solutions.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import null_space
 
+from ...core.arrays import AnyArray
 from ...core.linalg import adjoint
 from ...core.norms import first_frequencies
 from ...core.rounding import EPS
 from ..generalized_plant import GeneralizedPlant
-
-Array = npt.NDArray[Any]
 
 _RANK = float(np.sqrt(EPS))  # relative: signals that are smaller prove nothing
 
@@ -40,7 +36,7 @@ def frequency_bound(p: GeneralizedPlant, rounds: int = 5) -> float:
     return best
 
 
-def _bounds(side: tuple[Array, ...], rad: Array, dt: float) -> Array:
+def _bounds(side: tuple[AnyArray, ...], rad: AnyArray, dt: float) -> AnyArray:
     """Return the bounds at frequencies, rad/s, in discrete time rad per sample."""
     A, B, C, D, C_y, D_y = side
     n, m, q = len(A), B.shape[1], len(C_y)
@@ -63,7 +59,7 @@ def _bounds(side: tuple[Array, ...], rad: Array, dt: float) -> Array:
     return np.asarray(bounds * (1 - 100 * (n + m) * EPS * np.maximum(inverse.max(axis=1), 1.0)))
 
 
-def _grid(A: Array, dt: float) -> Array:
+def _grid(A: AnyArray, dt: float) -> AnyArray:
     """Frequencies of a first look, rad/s or rad per sample."""
     poles = np.linalg.eigvals(A)
     if dt == 0:

@@ -28,16 +28,14 @@ N : (f, a, b) over f frequencies, with Delta and X (f, b, a);  M : (f, a, m);  T
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.linalg import adjoint
 from ...core.rounding import AGREED, EPS, TINY
 from ..problem.observer_problem import ObserverProblem
 
-Array = npt.NDArray[Any]
 _SMALL = float(np.sqrt(TINY))  # what is divided by it and squared stays finite
 
 
@@ -45,12 +43,12 @@ _SMALL = float(np.sqrt(TINY))  # what is divided by it and squared stays finite
 class Ball:
     """The set ``{X_c + R_l Theta R_r}`` over frequency, with the right factor M already multiplied in."""
 
-    center: Array  # shape (f, b, m); ``X_c M``
-    left: Array  # shape (f, b, b); ``R_l``
-    right: Array  # shape (f, a, m); ``R_r M``
+    center: AnyArray  # shape (f, b, m); ``X_c M``
+    left: AnyArray  # shape (f, b, b); ``R_l``
+    right: AnyArray  # shape (f, a, m); ``R_r M``
 
     @classmethod
-    def of(cls, N: Array | None, M: Array, b: int) -> Ball:
+    def of(cls, N: AnyArray | None, M: AnyArray, b: int) -> Ball:
         """Build the ball of ``Delta (I - N Delta)^-1 M`` from N (f, a, b), None without a loop, and M (f, a, m)."""
         if N is None:
             f, _, m = M.shape
@@ -61,16 +59,16 @@ class Ball:
         X_c = (adjoint(Vh)[..., :k] * (s * radius**2)[..., None, :]) @ adjoint(U)[..., :k, :]
         return cls(X_c @ M, _with_gains(adjoint(Vh), radius), _with_gains(U, radius) @ M)
 
-    def bound(self, T: Array, certain: Array | float = 0.0) -> Array:
+    def bound(self, T: AnyArray, certain: AnyArray | float = 0.0) -> AnyArray:
         """Root of the H2 density of ``certain + T X M`` that no member exceeds, (f,); `certain` is (f, p, m)."""
         return dual_bound(certain + T @ self.center, T @ self.left, self.right)
 
-    def average(self) -> Array:
+    def average(self) -> AnyArray:
         """Average spectrum, shape (f, b, b)."""
         energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / max(self.right.shape[-2], self.left.shape[-1])
         return self.center @ adjoint(self.center) + energy[..., None, None] * (self.left @ adjoint(self.left))
 
-    def worst(self, T: Array, certain: Array | float = 0.0, iterations: int = 15) -> Array:
+    def worst(self, T: AnyArray, certain: AnyArray | float = 0.0, iterations: int = 15) -> AnyArray:
         """Contraction of an element that is (locally) worst for ``certain + T X M``, shape (f, b, a)."""
         P, Qh = T @ self.left, adjoint(self.right)
         left, right = adjoint(np.linalg.svd(P)[2]), np.linalg.svd(self.right)[0]
@@ -92,32 +90,32 @@ class Ball:
         return best
 
 
-def uncertain_ball(problem: ObserverProblem, freqs_hz: Array) -> Ball:
+def uncertain_ball(problem: ObserverProblem, freqs_hz: AnyArray) -> Ball:
     """Return the ball of ``Delta (I - N Delta)^-1 M`` of a problem at frequencies."""
     N = None if problem.N is None else problem.N.frequency_response(freqs_hz)
     return Ball.of(N, problem.M.frequency_response(freqs_hz), problem.W_L.n_inputs)
 
 
-def spread(P: Array, Q: Array) -> Array:
+def spread(P: AnyArray, Q: AnyArray) -> AnyArray:
     """Largest ``||P Theta Q||_F`` over contractions, ``(sum_i s_i(P)^2 s_i(Q)^2)^(1/2)``, shape (f,)."""
     s, t = np.linalg.svd(P, compute_uv=False), np.linalg.svd(Q, compute_uv=False)
     k = min(s.shape[-1], t.shape[-1])
     return np.sqrt(np.sum((s[..., :k] * t[..., :k]) ** 2, axis=-1))
 
 
-def _with_gains(U: Array, gains: Array) -> Array:
+def _with_gains(U: AnyArray, gains: AnyArray) -> AnyArray:
     """Return ``U diag(gains, 1, ...) U^H``."""
     gains = np.concatenate([gains, np.ones((*gains.shape[:-1], U.shape[-1] - gains.shape[-1]))], axis=-1)
     return (U * gains[..., None, :]) @ adjoint(U)
 
 
-def polar(matrix: Array) -> Array:
+def polar(matrix: AnyArray) -> AnyArray:
     """Return the unitary polar factors, shape (f, a, b)."""
     U, _, Vh = np.linalg.svd(matrix, full_matrices=False)
     return U @ Vh
 
 
-def dual_bound(a: Array, P: Array, Q: Array) -> Array:
+def dual_bound(a: AnyArray, P: AnyArray, Q: AnyArray) -> AnyArray:
     """Upper bound of ``max ||a + P Theta Q||_F`` over contractions, shape (f,)."""
     U, s, _ = np.linalg.svd(P, full_matrices=False)
     _, q, Hh = np.linalg.svd(Q, full_matrices=False)
@@ -135,7 +133,7 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     return np.where(np.isfinite(squared), np.sqrt(squared), np.inf)
 
 
-def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
+def _without_centre(s: AnyArray, q: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Optimal multipliers for ``a = 0``: the dual of the sorted assignment (s and q descend)."""
     rows, columns = s.shape[-1], q.shape[-1]
     size = max(rows, columns)
@@ -146,7 +144,9 @@ def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
     return g[..., :rows], np.maximum(s**2 * q**2 - g, 0.0)[..., :columns]
 
 
-def _descended(c: Array, d: Array, g: Array, multipliers: Array, sweeps: int = 10) -> tuple[Array, Array]:
+def _descended(
+    c: AnyArray, d: AnyArray, g: AnyArray, multipliers: AnyArray, sweeps: int = 10
+) -> tuple[AnyArray, AnyArray]:
     """Return better multipliers of rows and columns, by turns; sums run with frequencies last."""
     c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
     c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
@@ -157,7 +157,7 @@ def _descended(c: Array, d: Array, g: Array, multipliers: Array, sweeps: int = 1
     return np.moveaxis(rows, 0, -1), np.moveaxis(columns, 0, -1)
 
 
-def _best_rows(c: Array, shift: Array, steps: int = 4) -> Array:
+def _best_rows(c: AnyArray, shift: AnyArray, steps: int = 4) -> AnyArray:
     """Minimise ``x + sum_j c_ij / (x + shift_ij)`` over ``x >= 0``, ``x + shift_ij >= 0``, for every row i."""
     least = np.maximum(np.max(-shift, axis=1), 0.0)
     gap = least[:, None] + shift

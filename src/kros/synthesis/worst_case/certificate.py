@@ -16,11 +16,10 @@ at DC. Each panel carries the Gauss-Legendre rules of 7 and 10 points; panels wh
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import h2_norm
@@ -29,13 +28,12 @@ from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from .ball import spread, uncertain_ball
 
-Array = npt.NDArray[Any]
-Density = Callable[[ObserverProblem, StateSpace, Array], Array]
+Density = Callable[[ObserverProblem, StateSpace, AnyArray], AnyArray]
 
 _ACCURACY = 1e-5  # of the quadrature, relative; a hundred times as much for what is attained
 
 
-def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Array) -> Array:
+def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) -> AnyArray:
     """Certified worst-case power density of ``W_p e``, shape (f,), for the error system from (d, r, n, v[, s])."""
     m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response, T, certain, noise = _responses(problem, errors, freqs_hz)
@@ -48,7 +46,7 @@ def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Array) -> Ar
     return uncertain**2 + noise
 
 
-def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Array) -> Array:
+def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) -> AnyArray:
     """Power density of ``W_p e``, shape (f,), for a perturbation that is locally worst; without the remainder."""
     _, T, certain, noise = _responses(problem, errors, freqs_hz)
     ball = uncertain_ball(problem, freqs_hz)
@@ -57,13 +55,13 @@ def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Arr
 
 
 def _responses(
-    problem: ObserverProblem, errors: StateSpace, freqs_hz: Array
-) -> tuple[Array, Array, Array | float, Array]:
+    problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray
+) -> tuple[AnyArray, AnyArray, AnyArray | float, AnyArray]:
     """Return the response of an error system, T, ``T_s W_u``, and the density of noise."""
     white, direct = problem.nominal.n_inputs + problem.nominal.n_states, problem.error_inputs
     response = errors.frequency_response(freqs_hz)
     T = response[..., problem.uncertainty_input] @ problem.W_L.frequency_response(freqs_hz)
-    certain: Array | float = 0.0
+    certain: AnyArray | float = 0.0
     if errors.n_inputs > direct:
         certain = response[..., direct:] @ problem.input_weight.frequency_response(freqs_hz)
     return response, T, certain, np.sum(np.abs(response[..., white:direct]) ** 2, axis=(-2, -1))
@@ -74,7 +72,7 @@ def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, fl
     return certify_errors(problem, problem.error_system(controller))
 
 
-def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0) -> tuple[float, float]:
+def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> tuple[float, float]:
     """Return what `certify` returns, for the error system from (d, r, n, v[, s]) and the mean of ``W_p e``."""
     squared, error = _mean_square(problem, errors, density, _ACCURACY)
     squared += float(np.sum(np.square(mean)))
@@ -82,7 +80,7 @@ def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: Array | f
     return upper, upper - float(np.sqrt(squared))
 
 
-def attained(problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0) -> float:
+def attained(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> float:
     """Return a lower bound of this very observer's worst case: what a perturbation attains at every frequency."""
     squared, error = _mean_square(problem, errors, attained_density, 100 * _ACCURACY)
     return float(np.sqrt(max(squared - error, 0.0) + np.sum(np.square(mean))))
@@ -115,7 +113,7 @@ def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> 
     )
 
 
-def _log_poles(problem: ObserverProblem, loop: StateSpace) -> Array:
+def _log_poles(problem: ObserverProblem, loop: StateSpace) -> AnyArray:
     """Logarithms of all poles, in the upper half plane."""
     systems = [loop, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
     poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
@@ -129,7 +127,7 @@ _ALL = np.concatenate([_NODES, _ROUGH_NODES])
 
 
 def circle_mean(
-    density: Callable[[Array], Array], centers: Array, rtol: float, max_panels: int = 4000
+    density: Callable[[AnyArray], AnyArray], centers: AnyArray, rtol: float, max_panels: int = 4000
 ) -> tuple[float, float]:
     """Return mean and error over the circle of an even density of angles (k,); `centers` are log poles."""
     edges = _edges(centers)
@@ -149,7 +147,7 @@ def circle_mean(
     return float(values.sum() / np.pi), float(errors.sum() / np.pi)
 
 
-def _edges(centers: Array) -> Array:
+def _edges(centers: AnyArray) -> AnyArray:
     """Panel edges: three a decade, and a row of widths around each pole's angle."""
     angle, width = np.abs(centers.imag), np.abs(centers.real)
     size = np.hypot(angle, width)
@@ -162,7 +160,7 @@ def _edges(centers: Array) -> Array:
     return np.concatenate([[0.0], edges[apart]])
 
 
-def _panels(density: Callable[[Array], Array], left: Array, right: Array) -> tuple[Array, Array]:
+def _panels(density: Callable[[AnyArray], AnyArray], left: AnyArray, right: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Both rules on every panel; logarithmic inside, linear in the panel that touches DC."""
     linear = left <= 0
     log_left = np.log(np.where(linear, 1.0, left))

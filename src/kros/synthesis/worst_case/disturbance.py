@@ -11,15 +11,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.rounding import ROUNDING
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import disturbed
 from .ball import uncertain_ball
 
-Array = npt.NDArray[Any]
 Fit = Callable[..., Any]
 
 _FLOOR, _NOTHING = 1e-14, 1e-30  # relative power below which a channel is level; power of a channel that is absent
@@ -38,7 +37,7 @@ def average_disturbance(problem: ObserverProblem, fit: Fit) -> tuple[StateSpace,
     return disturbed(problem, shaped, None if rest is None else filters(rest, freqs, problem.nominal.dt, fit))
 
 
-def design_grid(problem: ObserverProblem, count: int = 400) -> Array:
+def design_grid(problem: ObserverProblem, count: int = 400) -> AnyArray:
     """Frequencies for the design, Hz: logarithmic from well below the slowest pole to Nyquist."""
     dt = problem.nominal.dt
     systems = [problem.nominal, problem.W_L, problem.W_R, problem.input_weight]
@@ -61,7 +60,7 @@ def is_diagonal(system: StateSpace) -> bool:
     return True
 
 
-def _remainder(problem: ObserverProblem, freqs_hz: Array) -> Array | None:
+def _remainder(problem: ObserverProblem, freqs_hz: AnyArray) -> AnyArray | None:
     """Average spectrum of the remainder, shape (f, n)."""
     if problem.remainder_left is None or problem.remainder_right is None:
         return None
@@ -71,7 +70,7 @@ def _remainder(problem: ObserverProblem, freqs_hz: Array) -> Array | None:
     return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
 
-def filters(power: Array, freqs_hz: Array, dt: float, fit: Fit) -> StateSpace:
+def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, fit: Fit) -> StateSpace:
     """Return one filter a channel, whose magnitude touches the root of its power, shape (f, channels), from above."""
     systems = []
     for column in power.T:

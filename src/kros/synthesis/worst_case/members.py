@@ -14,19 +14,16 @@ perturbation add.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.rounding import ROUNDING
 from ..problem.interconnect import interconnect
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import disturbed, shaped_plant
 from ..riccati.kalman import predictor_bound
-
-Array = npt.NDArray[Any]
 
 
 def lower_bound(problem: ObserverProblem) -> float | None:
@@ -41,13 +38,13 @@ def lower_bound(problem: ObserverProblem) -> float | None:
     return max((bound for bound in bounds if bound > 0), default=None)
 
 
-def shifts(rows: int, columns: int) -> list[Array]:
+def shifts(rows: int, columns: int) -> list[AnyArray]:
     """Return the cyclic shifts of the identity that have this shape or are cut to it: contractions."""
     size = max(rows, columns)
     return [np.roll(np.eye(size), k, axis=0)[:rows, :columns] for k in range(size)]
 
 
-def member(problem: ObserverProblem, delta: Array) -> StateSpace:
+def member(problem: ObserverProblem, delta: AnyArray) -> StateSpace:
     """Return ``W_L Delta (I - N Delta)^-1 M`` for a constant contraction."""
     b, a = delta.shape
     blocks = {"M": problem.M, "Delta": gain(delta, problem.nominal.dt), "W_L": problem.W_L}

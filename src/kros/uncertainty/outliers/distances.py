@@ -10,35 +10,32 @@ magnitudes), so that every row and column of the residual counts alike.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Flags
 from ...core.linalg import entries_first, sigma_max_first, squared
 from ..forms import Form, residual
 from ..settings import OUTLIER
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Distances:
     """Distances of all units."""
 
-    nominals: Array  # (nominal,): rows of the units that were the nominal in turn
-    peaks: Array  # (nominal, unit), dB: largest level with one nominal; NaN against itself
-    levels: Array  # (unit, frequency), dB: smoothed singular value of the scaled residual, median over the nominals
-    left: Array  # (frequency, p'): typical size of the residual's rows
-    right: Array  # (frequency, m'): of its columns
+    nominals: AnyArray  # (nominal,): rows of the units that were the nominal in turn
+    peaks: AnyArray  # (nominal, unit), dB: largest level with one nominal; NaN against itself
+    levels: AnyArray  # (unit, frequency), dB: smoothed singular value of the scaled residual, median over the nominals
+    left: AnyArray  # (frequency, p'): typical size of the residual's rows
+    right: AnyArray  # (frequency, m'): of its columns
 
-    def joined(self, levels: Array) -> Distances:
+    def joined(self, levels: AnyArray) -> Distances:
         """Return the distances with one more unit, whose levels (nominal, frequency) are known; it comes last."""
         peaks = np.hstack([self.peaks, levels.max(axis=1)[:, None]])
         return replace(self, peaks=peaks, levels=np.vstack([self.levels, np.median(levels, axis=0)]))
 
 
-def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
+def distances(form: Form, responses: AnyArray, freqs_hz: AnyArray) -> Distances:
     """Return the distances of all units, shape (unit, frequency, p, m), in scaled coordinates."""
     nominals = _nominals(responses)
     itself = nominals[:, None] == np.arange(len(responses))
@@ -51,7 +48,7 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
     return Distances(nominals, level.max(axis=2), median, np.concatenate(left), np.concatenate(right))
 
 
-def _scaled(form: Form, G: Array, nominals: Array, itself: Array) -> tuple[Array, Array, Array]:
+def _scaled(form: Form, G: AnyArray, nominals: AnyArray, itself: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Return singular values (nominal, unit, frequency) of residuals in units of their typical entries, and these."""
     E = np.stack([residual(form, G[k], G) for k in nominals])  # (nominal, unit, frequency, p', m')
     E[_same(G, nominals)] = 0.0
@@ -63,13 +60,13 @@ def _scaled(form: Form, G: Array, nominals: Array, itself: Array) -> tuple[Array
     return sigma_max_first(entries_first(E / left[:, :, None] / right[:, None, :])), left, right
 
 
-def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances, freqs_hz: Array) -> Array:
+def scaled_levels(form: Form, nominal: AnyArray, perturbed: AnyArray, found: Distances, freqs_hz: AnyArray) -> AnyArray:
     """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB."""
     E = residual(form, nominal, perturbed) / found.left[:, :, None] / found.right[:, None, :]
     return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), OUTLIER.least)), freqs_hz)
 
 
-def typical(squares: Array) -> tuple[Array, Array]:
+def typical(squares: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return left and right scales that bring squared entries to equal row and column sums."""
     row = squares.max(axis=2, keepdims=True)
     row = np.where(row > 0, row, 1.0)
@@ -83,13 +80,13 @@ def typical(squares: Array) -> tuple[Array, Array]:
     return np.sqrt(left * row[:, :, 0]), np.sqrt(right * column[:, 0])
 
 
-def balance(responses: Array) -> tuple[Array, Array]:
+def balance(responses: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return ranges of outputs and inputs from responses themselves."""
     left, right = typical(np.median(squared(responses), axis=(0, 1))[None])
     return left[0], 1 / right[0]
 
 
-def _nominals(G: Array) -> Array:
+def _nominals(G: AnyArray) -> AnyArray:
     """All units, or 64 spread evenly over their distances from the entrywise median."""
     if len(G) <= OUTLIER.nominals:
         return np.arange(len(G))
@@ -99,14 +96,14 @@ def _nominals(G: Array) -> Array:
     return np.sort(order[np.linspace(0, len(G) - 1, OUTLIER.nominals).round().astype(int)])
 
 
-def _same(G: Array, nominals: Array) -> npt.NDArray[np.bool_]:
+def _same(G: AnyArray, nominals: AnyArray) -> Flags:
     """Tell where nominal and unit are equal but for rounding, shape (nominal, unit, frequency)."""
     size = np.abs(G).max(axis=(2, 3))
     apart = np.stack([np.abs(G - G[k]).max(axis=(2, 3)) for k in nominals])
     return apart <= OUTLIER.smallest * np.maximum(size, size[nominals][:, None])
 
 
-def _smooth(level: Array, freqs: Array) -> Array:
+def _smooth(level: AnyArray, freqs: AnyArray) -> AnyArray:
     """Moving average over log frequency, to a billionth of a dB."""
     x = np.log10(freqs)
     near = (np.abs(x[:, None] - x) <= OUTLIER.smoothing / 2).astype(float)

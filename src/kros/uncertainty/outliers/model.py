@@ -26,8 +26,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, ArrayLike
 from ...core.artifacts import Storable
 from ...core.errors import ConfigError, DataError
 from ..forms import Form, as_form, check_responses
@@ -35,8 +35,6 @@ from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
 from .score import Comparison, OutlierScore, Status
 from .tail import LEAST_SCORES, margins, separate
-
-Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,16 +70,16 @@ class OutlierModel(Storable):
     KIND = "outlier_model"
     form: Form
     unit_ids: tuple[str, ...]
-    freqs_hz: Array
-    responses: Array
-    output_scale: Array
-    input_scale: Array
+    freqs_hz: AnyArray
+    responses: AnyArray
+    output_scale: AnyArray
+    input_scale: AnyArray
     scores: tuple[OutlierScore, ...]
     threshold_db: float
     false_alarm_rate: float
 
     def score(
-        self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None
+        self, unit: str, response: ArrayLike, without: Collection[str] = (), motion_db: AnyArray | None = None
     ) -> OutlierScore:
         """Score a new unit by its response (frequency, p, m) at `freqs_hz`, in physical units.
 
@@ -107,7 +105,7 @@ class OutlierModel(Storable):
         certain = margin - float(level.max() - 20 * np.log10(beyond.max()))
         return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
 
-    def _comparison(self, rows: Array, response: Array) -> Comparison:
+    def _comparison(self, rows: AnyArray, response: AnyArray) -> Comparison:
         """Return some inliers and one more unit, which comes last."""
         responses = self.responses[rows]
         known = self._known if len(rows) == len(self.unit_ids) else distances(self.form, responses, self.freqs_hz)
@@ -116,7 +114,7 @@ class OutlierModel(Storable):
         everyone = np.concatenate([responses, response[None]])
         return Comparison(self.form, everyone, self.freqs_hz, known.joined(levels), inliers)
 
-    def motion_levels(self, one: Array, other: Array) -> Array:
+    def motion_levels(self, one: AnyArray, other: AnyArray) -> AnyArray:
         """Return the level, shape (frequency,), dB, by which estimates differ where motions do.
 
         Responses have the shape (unit, frequency, p, m); the median over the units counts. Halves scatter twice as much
@@ -142,8 +140,8 @@ class OutlierModel(Storable):
 
 
 def score_outliers(
-    responses: npt.ArrayLike | Sequence[npt.ArrayLike],
-    freqs_hz: npt.ArrayLike,
+    responses: ArrayLike | Sequence[ArrayLike],
+    freqs_hz: ArrayLike,
     form: Form | str = Form.ADDITIVE,
     *,
     unit_ids: tuple[str, ...] | None = None,
@@ -204,14 +202,14 @@ def score_outliers(
     return OutlierModel(form, names, freqs, G[inliers], *scales, scores, parts.threshold_db, rate)
 
 
-def scored_rows(count: int) -> Array:
+def scored_rows(count: int) -> AnyArray:
     """Return the rows of frequencies that scores look at, where they are given more."""
     return np.unique(np.linspace(0, count - 1, OUTLIER.frequencies).round().astype(int))
 
 
 def _population(
     responses: Any, unit_ids: tuple[str, ...] | None, freqs_hz: Any
-) -> tuple[Array, tuple[str, ...], Array]:
+) -> tuple[AnyArray, tuple[str, ...], AnyArray]:
     """Checked responses, names and frequencies."""
     freqs = np.asarray(freqs_hz, float)
     G = check_responses(responses, unit_ids, freqs)

@@ -16,8 +16,8 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.work import Work
 from ...identify import Factor, ModelSet, combine
 from ...identify.factors import lifted_factor
@@ -83,9 +83,6 @@ def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: fl
     return row | {"episodes": episodes, "recorded_s": recorded_s, "needed_s": recorded_s * score.more_data}
 
 
-Array = npt.NDArray[Any]
-
-
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """Episodes that a unit is identified from."""
@@ -115,10 +112,10 @@ class Recorded:
 
     models: ModelSet  # of the kind that is scored
     units: Mapping[str, Evidence]  # training episodes of every unit of `models`
-    freqs_hz: Array  # (frequency,), Hz
+    freqs_hz: AnyArray  # (frequency,), Hz
 
     @classmethod
-    def of(cls, factors: EpisodeFactors, models: ModelSet, freqs_hz: Array) -> Recorded:
+    def of(cls, factors: EpisodeFactors, models: ModelSet, freqs_hz: AnyArray) -> Recorded:
         """Take the units of models from the factors of all training episodes of a condition."""
         rows = {unit: factors.factor[factors.rows_of(unit)] for unit in models.unit_ids}
         units = {unit: Evidence.of(factor, models, models.parameters_of(unit)) for unit, factor in rows.items()}
@@ -129,7 +126,7 @@ class Recorded:
         """Samples of the middle unit."""
         return float(np.median([e.n_samples for e in self.units.values()]))
 
-    def response(self, evidence: Sequence[Evidence]) -> Array:
+    def response(self, evidence: Sequence[Evidence]) -> AnyArray:
         """Return responses of estimates, shape (estimate, frequency, n, m)."""
         factors = [combine(e.lifted).R for e in evidence]
         sizes = np.sqrt([self.usual / e.n_samples for e in evidence])
@@ -137,7 +134,7 @@ class Recorded:
         names = tuple(map(str, range(len(factors))))
         return replace(self.models, unit_ids=names, A=fitted.A, B=fitted.B).responses(self.freqs_hz)
 
-    def halves(self) -> tuple[Array, Array] | None:
+    def halves(self) -> tuple[AnyArray, AnyArray] | None:
         """Return the responses of all units from every second episode, and from the others."""
         several = [e for e in self.units.values() if len(e.factor.R) > 1]
         one, other = ([e.part(range(k, len(e.factor.R), 2)) for e in several] for k in (0, 1))

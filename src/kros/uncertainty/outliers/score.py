@@ -9,17 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Flags
 from ..forms import Form
 from ..settings import OUTLIER
 from .distances import Distances, scaled_levels
-from .tail import Flags, excesses
-
-Array = npt.NDArray[Any]
+from .tail import excesses
 
 # below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
 FEWEST_UNITS = OUTLIER.fewest
@@ -73,8 +70,8 @@ class Comparison:
     """
 
     form: Form
-    responses: Array  # (unit, frequency, p, m), scaled
-    freqs_hz: Array
+    responses: AnyArray  # (unit, frequency, p, m), scaled
+    freqs_hz: AnyArray
     distances: Distances
     inliers: Flags
 
@@ -105,7 +102,7 @@ class Comparison:
         return replace(score, status=status, detectable_percent=smallest, detectable_hz=hz)
 
     @cached_property
-    def _changes(self) -> Array:
+    def _changes(self) -> AnyArray:
         """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
         G = self.responses[self.inliers]
         G = G[np.unique(np.linspace(0, len(G) - 1, min(OUTLIER.changed, len(G))).round().astype(int))]

@@ -18,20 +18,17 @@ Levels of lighter tails (normal, bounded, of two suppliers) exceed this less oft
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, Flags
 from ..settings import OUTLIER
-
-Array = npt.NDArray[Any]
-Flags = npt.NDArray[np.bool_]
 
 LEAST_SCORES = 3
 
 
-def prediction_bound(scores: Array, rate: float) -> Array:
+def prediction_bound(scores: AnyArray, rate: float) -> AnyArray:
     """Return what one further score exceeds with probability `rate`, from scores of shape (..., score), dB."""
     x = np.moveaxis(np.asarray(scores, float), -1, 0)
     if len(x) < LEAST_SCORES:
@@ -44,12 +41,12 @@ def factor(count: int, rate: float) -> float:
     return float(max((count - 1) * np.expm1(-np.log(rate * (count + 1)) / (count - 1)), 0.0))
 
 
-def scale(levels: Array) -> Array:
+def scale(levels: AnyArray) -> AnyArray:
     """Return b over the first axis, of at least two levels."""
     return _scale(len(levels), levels.sum(axis=0), levels.min(axis=0), levels.max(axis=0))
 
 
-def scales_without_one(levels: Array) -> Array:
+def scales_without_one(levels: AnyArray) -> AnyArray:
     """Return b of all but one for each of at least three levels, of the shape of `levels`."""
     ordered, rows = np.sort(levels, axis=0), np.arange(len(levels)).reshape(-1, *[1] * (levels.ndim - 1))
     least = np.where(rows == levels.argmin(axis=0), ordered[1], ordered[0])
@@ -57,11 +54,11 @@ def scales_without_one(levels: Array) -> Array:
     return _scale(len(levels) - 1, levels.sum(axis=0) - levels, least, largest)
 
 
-def _scale(count: int, total: Array, least: Array, largest: Array) -> Array:
+def _scale(count: int, total: AnyArray, least: AnyArray, largest: AnyArray) -> AnyArray:
     return np.asarray(np.maximum(total - count * least + largest - least, 0.0) / (count - 1))
 
 
-def excesses(peaks: Array, inliers: Flags) -> Array:
+def excesses(peaks: AnyArray, inliers: Flags) -> AnyArray:
     """Return what largest levels (..., unit) exceed those of all inliers but the unit itself by; NaN is no level."""
     known = np.where(inliers & np.isfinite(peaks), peaks, -np.inf)
     second, first = np.moveaxis(np.sort(known, axis=-1)[..., -2:], -1, 0)
@@ -69,7 +66,7 @@ def excesses(peaks: Array, inliers: Flags) -> Array:
     return np.asarray(peaks - np.where(largest, second[..., None], first[..., None]))
 
 
-def margins(levels: Array, inliers: Flags, rate: float) -> tuple[Array, Array]:
+def margins(levels: AnyArray, inliers: Flags, rate: float) -> tuple[AnyArray, AnyArray]:
     """Return every unit's excess over the inliers, itself left out, and how far that is beyond their bound."""
     known, count = levels[inliers], int(inliers.sum())
     if count < 2:
@@ -85,11 +82,11 @@ class Separation(NamedTuple):
     """Inliers and outliers."""
 
     inliers: Flags  # (unit,)
-    margin_db: Array  # (unit,), dB: beyond the bound when the unit went out, or at last; minus infinity unknown
+    margin_db: AnyArray  # (unit,), dB: beyond the bound when the unit went out, or at last; minus infinity unknown
     threshold_db: float  # dB: what the largest excess of the inliers would have to exceed
 
 
-def separate(levels: Array, rate: float) -> Separation:
+def separate(levels: AnyArray, rate: float) -> Separation:
     """Take units out while the largest excess is beyond the bound of the others, up to a third of them."""
     n = len(levels)
     inliers, margin = np.ones(n, bool), np.full(n, -np.inf)

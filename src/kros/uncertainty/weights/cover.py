@@ -20,18 +20,15 @@ Weights are stable systems that are above a cover, `E_k = W_L Delta_k W_R` with 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, ArrayLike
 from ...core.linalg import entries_first, multiply, sigma_max_first, squared
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, TINY
 from ..settings import FIT, PROOF
 from .proof import Method
-
-Array = npt.NDArray[Any]
 
 _STEP = np.cbrt(EPS)  # nepers, of differences
 
@@ -40,18 +37,18 @@ _STEP = np.cbrt(EPS)  # nepers, of differences
 class Cover:
     """Magnitudes of a cover; one right entry is one at every frequency: the scale between left and right is free."""
 
-    left: Array  # (frequency, p')
-    right: Array  # (frequency, m')
+    left: AnyArray  # (frequency, p')
+    right: AnyArray  # (frequency, m')
 
-    def at(self, rows: Array) -> Cover:
+    def at(self, rows: AnyArray) -> Cover:
         """Return the cover at some frequencies."""
         return Cover(self.left[rows], self.right[rows])
 
-    def cost_db(self) -> Array:
+    def cost_db(self) -> AnyArray:
         """Return mean log left plus mean log right, in dB, shape (frequency,)."""
         return 20 * (np.log10(self.left).mean(axis=1) + np.log10(self.right).mean(axis=1))
 
-    def ratio(self, E: Array) -> Array:
+    def ratio(self, E: AnyArray) -> AnyArray:
         """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), of residuals at the same frequencies."""
         left, right = (1 / np.maximum(v.T, TINY) for v in (self.left, self.right))
         return sigma_max_first(entries_first(E) * left[:, None, None, :] * right[None, :, None, :])
@@ -69,13 +66,13 @@ class Weight:
     overbound_db_max: float  # dB: largest excess of `Cover.cost_db` over the optimal cover
     method: Method = Method.GRID  # how the bound between grid points is known, see `proof`
 
-    def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
+    def magnitudes(self, freqs_hz: ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
         left, right = (side.frequency_response(freqs_hz) for side in (self.left, self.right))
         return Cover(np.abs(np.einsum("fii->fi", left)), np.abs(np.einsum("fii->fi", right)))
 
 
-def optimal_cover(E: Array) -> Cover:
+def optimal_cover(E: AnyArray) -> Cover:
     """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes."""
     p = E.shape[2]
     x = _descend(entries_first(E), p)
@@ -85,7 +82,7 @@ def optimal_cover(E: Array) -> Cover:
     return Cover(shape.left * shape.ratio(E).max(axis=0)[:, None], right)
 
 
-def _descend(first: Array, p: int) -> Array:
+def _descend(first: AnyArray, p: int) -> AnyArray:
     """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
     size = sigma_max_first(first).max(axis=0)
     alive = np.flatnonzero(size > 0)
@@ -109,11 +106,11 @@ def _descend(first: Array, p: int) -> Array:
 class _Smooth:
     """The smoothed cost of residuals (p', m', unit, frequency)."""
 
-    E: Array
+    E: AnyArray
     p: int
     squarings: int
 
-    def cost(self, x: Array) -> tuple[Array, Array]:
+    def cost(self, x: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Return the cost, shape (frequency,), and its gradient, shape of x."""
         p, m = self.p, len(x) - self.p
         M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
@@ -134,7 +131,7 @@ class _Smooth:
         return cost, gradient + FIT.pull * x
 
 
-def _newton(smooth: _Smooth, x: Array) -> Array:
+def _newton(smooth: _Smooth, x: AnyArray) -> AnyArray:
     """Take one Newton step, shortened where the cost does not fall; the Hessian from differences of the gradient."""
     cost, gradient = smooth.cost(x)
     ahead = (x + _STEP * unit[:, None] for unit in np.eye(len(x)))

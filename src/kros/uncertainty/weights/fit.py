@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.frequency import bilinear_squared, nyquist_hz
 from ...core.lti import StateSpace, block_diagonal, gain
 from ..forms import Form, completion, residual
@@ -23,11 +22,9 @@ from .cover import Cover, Weight, optimal_cover
 from .joint import JointProblem, fit_jointly, refit
 from .proof import Certificate, ResidualSystems, certify
 
-Array = npt.NDArray[Any]
-
 
 def fit_weight(
-    residuals: Residuals, freqs_hz: Array, sample_period_s: float, max_order: int = 4, tolerance_db: float = 1.0
+    residuals: Residuals, freqs_hz: AnyArray, sample_period_s: float, max_order: int = 4, tolerance_db: float = 1.0
 ) -> tuple[Weight, Cover]:
     """Return diagonal weights that cover all units at all frequencies, and the optimal cover at `freqs_hz`.
 
@@ -50,7 +47,7 @@ def fit_weight(
     return replace(weight, overbound_db_max=float(excess.max(initial=0.0))), cover
 
 
-def checking_grid(freqs_hz: Array, sample_period_s: float) -> Array:
+def checking_grid(freqs_hz: AnyArray, sample_period_s: float) -> AnyArray:
     """Return a dense grid from DC to Nyquist: a fit is free to bend wherever nothing is checked."""
     inside, steps = freqs_hz[freqs_hz > 0], np.arange(PROOF.density) / PROOF.density
     between = (inside[:-1, None] * (inside[1:] / inside[:-1])[:, None] ** steps).ravel()
@@ -62,7 +59,7 @@ def checking_grid(freqs_hz: Array, sample_period_s: float) -> Array:
     return joined(dense, np.arctan(np.sqrt(logs)) / (np.pi * sample_period_s))
 
 
-def joined(freqs_hz: Array, others_hz: Array) -> Array:
+def joined(freqs_hz: AnyArray, others_hz: AnyArray) -> AnyArray:
     """Return both in increasing order, without those of the others that are nearly there, or nearly one."""
     others = np.unique(others_hz)
     others = others[np.diff(others, prepend=-1.0) > PROOF.rounding * others]
@@ -75,7 +72,7 @@ def joined(freqs_hz: Array, others_hz: Array) -> Array:
 class _Fit:
     """One fit, and again with frequencies that it missed."""
 
-    def __init__(self, residuals: Residuals, freqs_hz: Array, dt: float) -> None:
+    def __init__(self, residuals: Residuals, freqs_hz: AnyArray, dt: float) -> None:
         self.residuals, self.dt, self.band = residuals, dt, freqs_hz[[0, -1]]
         grid, realised = checking_grid(freqs_hz, dt), residuals.realised
         modes = np.zeros(0) if realised is None else realised.modes_hz(grid)
@@ -95,23 +92,23 @@ class _Fit:
         self.fitted = fit_jointly(self.problem, near, max_order, tolerance_db)
         return self._weight()
 
-    def costly(self, weight: Weight) -> Array:
+    def costly(self, weight: Weight) -> AnyArray:
         """Return the frequencies between those of the fit, Hz, at which the weight costs more than at them."""
         if not weight.left.D.any():
             return np.zeros(0)
         cost = weight.magnitudes(self.freqs_hz).cost_db() - self.optimal.cost_db() - self.fitted.excess_db
         return np.asarray(self.freqs_hz[_peaks(10 ** ((np.nan_to_num(cost, posinf=0.0) - FIT.missed_db) / 20))])
 
-    def again(self, missed_hz: Array) -> Weight:
+    def again(self, missed_hz: AnyArray) -> Weight:
         """Fit again, with the largest residuals at further frequencies."""
         self.problem = self.problem.joined(self._problem(np.unique(missed_hz))[0])
         self.fitted = refit(self.problem, self.fitted.sections)
         return self._weight()
 
-    def proven(self, weight: Weight) -> tuple[Certificate, Array]:
+    def proven(self, weight: Weight) -> tuple[Certificate, AnyArray]:
         """Certify a weight for all units; return its largest ratios on the checked grid, too."""
 
-        def ratio(freqs_hz: Array) -> Array:
+        def ratio(freqs_hz: AnyArray) -> AnyArray:
             return self.residuals.ratio(weight.magnitudes(freqs_hz), freqs_hz)
 
         known, realised = ratio(self.checked_hz), self.residuals.realised
@@ -123,7 +120,7 @@ class _Fit:
         systems, orders = sections.systems(self.dt), tuple(sections.orders.tolist())
         return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:], np.nan, np.nan)
 
-    def _problem(self, freqs_hz: Array) -> tuple[JointProblem, Cover]:
+    def _problem(self, freqs_hz: AnyArray) -> tuple[JointProblem, Cover]:
         """Return the largest residuals by the optimal cover, with its cost within the band, and the cover."""
         best, E = self.optimal, self.residuals.at(freqs_hz)
         known = np.flatnonzero(best.left.min(axis=1) > 0)
@@ -146,7 +143,7 @@ def _lifted(weight: Weight, proof: Certificate, on_grid: float) -> Weight:
     return replace(weight, left=left, cover_max=on_grid / lift, method=proof.method)
 
 
-def _peaks(ratio: Array) -> Array:
+def _peaks(ratio: AnyArray) -> AnyArray:
     """Return the indices of the worst local maxima above one."""
     inner = np.concatenate([[-np.inf], ratio, [-np.inf]])
     tops = np.flatnonzero((ratio >= inner[:-2]) & (ratio >= inner[2:]) & (ratio > 1))
@@ -158,24 +155,24 @@ class Residuals:
     """Residuals of scaled units against a nominal, or remainders of the form, as functions of frequency, Hz."""
 
     form: Form
-    nominal: Callable[[Array], Array]  # response (frequency, p, m)
-    units: Callable[[Array, slice], Array]  # responses (unit, frequency, p, m) of some units
+    nominal: Callable[[AnyArray], AnyArray]  # response (frequency, p, m)
+    units: Callable[[AnyArray, slice], AnyArray]  # responses (unit, frequency, p, m) of some units
     count: int  # of units
     systems: tuple[StateSpace, StateSpace] | None = None  # nominal and units, whose modes and pencils are looked at
     remainder: bool = False
 
-    def pieces(self, freqs_hz: Array) -> Iterator[tuple[Array, Array]]:
+    def pieces(self, freqs_hz: AnyArray) -> Iterator[tuple[AnyArray, AnyArray]]:
         """Yield responses and residuals, a few units at a time: memory does not grow with their number."""
         G, step = self.nominal(freqs_hz), max(1, SET.at_once // max(1, len(freqs_hz)))
         for start in range(0, self.count, step):
             Gp = self.units(freqs_hz, slice(start, start + step))
             yield Gp, completion(self.form, G, Gp)[1] if self.remainder else residual(self.form, G, Gp)
 
-    def at(self, freqs_hz: Array) -> Array:
+    def at(self, freqs_hz: AnyArray) -> AnyArray:
         """Return residuals, shape (unit, frequency, p', m')."""
         return np.concatenate([E for _, E in self.pieces(freqs_hz)])
 
-    def ratio(self, cover: Cover, freqs_hz: Array) -> Array:
+    def ratio(self, cover: Cover, freqs_hz: AnyArray) -> AnyArray:
         """Return the ratios of all units to a cover at the same frequencies, shape (unit, frequency)."""
         return np.concatenate([cover.ratio(E) for _, E in self.pieces(freqs_hz)])
 

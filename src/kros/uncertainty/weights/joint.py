@@ -20,18 +20,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.rounding import TINY
 from ..settings import FIT
 from .cover import Cover
 from .magnitude import Bound, rising_bounds
 from .sections import Sections
-
-Array = npt.NDArray[Any]
 
 NEPER_DB = 20 / np.log(10.0)
 
@@ -40,13 +37,13 @@ NEPER_DB = 20 / np.log(10.0)
 class JointProblem:
     """Residuals of units at frequencies, and the cost that is to be met there."""
 
-    tau: Array  # (frequency,)
-    optimal: Array  # (frequency,), nepers: mean log left plus mean log right; infinite where nothing has to be tight
-    residuals: Array  # (n, p', m'), complex
-    at: Array  # (n,): the frequency of each
+    tau: AnyArray  # (frequency,)
+    optimal: AnyArray  # (frequency,), nepers: mean log left plus mean log right; infinite where nothing has to be tight
+    residuals: AnyArray  # (n, p', m'), complex
+    at: AnyArray  # (n,): the frequency of each
 
     @classmethod
-    def of(cls, tau: Array, optimal: Array, E: Array) -> JointProblem:
+    def of(cls, tau: AnyArray, optimal: AnyArray, E: AnyArray) -> JointProblem:
         """Return the problem of residuals (unit, frequency, p', m')."""
         return cls(tau, optimal, E.reshape(-1, *E.shape[2:]), np.tile(np.arange(len(tau)), len(E)))
 
@@ -109,12 +106,12 @@ def refit(problem: JointProblem, start: Sections) -> JointFit:
 class _Terms:
     """Terms under one smoothed maximum: values, frequencies, and how much every entry moves each."""
 
-    values: Array  # (n,)
-    at: Array  # (n,)
-    shares: Array  # (n, entry)
+    values: AnyArray  # (n,)
+    at: AnyArray  # (n,)
+    shares: AnyArray  # (n, entry)
     price: float
 
-    def smoothed(self, temperature: float) -> tuple[float, Array]:
+    def smoothed(self, temperature: float) -> tuple[float, AnyArray]:
         """Return the smoothed maximum, and its derivative by every value."""
         top = float(self.values.max())
         weight = np.exp((self.values - top) / temperature)
@@ -127,7 +124,7 @@ class _State:
 
     problem: JointProblem
     sections: Sections
-    start: Array  # parameters
+    start: AnyArray  # parameters
 
     @cached_property
     def terms(self) -> tuple[_Terms, ...]:
@@ -154,7 +151,7 @@ class _State:
         smoothed = sum(terms.smoothed(temperature)[0] for terms in self.terms)
         return smoothed + FIT.pull / 2 * float(away @ away)
 
-    def derivatives(self, temperature: float) -> tuple[Array, Array]:
+    def derivatives(self, temperature: float) -> tuple[AnyArray, AnyArray]:
         """Return the gradient, and the spread of the gradients."""
         gradient = FIT.pull * (self.sections.parameters - self.start)
         spread, slopes = FIT.pull * np.eye(len(self.start)), self.sections.slopes(self.problem.tau)
@@ -184,7 +181,7 @@ class _State:
         return JointFit(lifted, (excess + deficit) * NEPER_DB)
 
 
-def _singular(matrices: Array) -> tuple[Array, Array]:
+def _singular(matrices: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return log singular values, (n, rank), and squared moduli of the entries of their vectors, left then right."""
     adjoint = np.conj(np.swapaxes(matrices, 1, 2))
     wide = matrices.shape[1] <= matrices.shape[2]

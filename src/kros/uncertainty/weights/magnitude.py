@@ -33,19 +33,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, pairwise
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray, ArrayLike
 from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
 from ...core.rounding import EPS, TINY
 from ..settings import MAGNITUDE
 from .sections import Sections
-
-Array = npt.NDArray[Any]
 
 _LOG = logging.getLogger(__name__)
 
@@ -64,8 +61,8 @@ class FittedMagnitude:
 
 
 def fit_magnitude(
-    freqs_hz: npt.ArrayLike,
-    magnitude: npt.ArrayLike,
+    freqs_hz: ArrayLike,
+    magnitude: ArrayLike,
     sample_period_s: float,
     *,
     max_order: int = 4,
@@ -134,7 +131,7 @@ class Bound:
     excess_db: float
 
 
-def rising_bounds(tau: Array, magnitude: Array, max_order: int) -> Iterator[Bound]:
+def rising_bounds(tau: AnyArray, magnitude: AnyArray, max_order: int) -> Iterator[Bound]:
     """Yield the tightest bounds of positive magnitudes at increasing tau, order by order, or a better lower one."""
     values = np.maximum(magnitude, MAGNITUDE.floor * magnitude.max())
     unit = float(np.exp(np.mean(np.log(values))))
@@ -155,7 +152,7 @@ def rising_bounds(tau: Array, magnitude: Array, max_order: int) -> Iterator[Boun
             break
 
 
-def _touching(bound: Bound, freqs: Array, values: Array, dt: float) -> FittedMagnitude:
+def _touching(bound: Bound, freqs: AnyArray, values: AnyArray, dt: float) -> FittedMagnitude:
     """Return the system of a bound, scaled until it touches the values as evaluated."""
     (system,) = bound.sections.systems(dt)
     ratio = np.abs(system.frequency_response(freqs)[:, 0, 0]) / values
@@ -164,7 +161,7 @@ def _touching(bound: Bound, freqs: Array, values: Array, dt: float) -> FittedMag
     return FittedMagnitude(lifted, float(20 * np.log10(ratio.max() / ratio.min())))
 
 
-def _best(tau: Array, targets: Array, order: int, gamma: float) -> RationalMagnitude | None:
+def _best(tau: AnyArray, targets: AnyArray, order: int, gamma: float) -> RationalMagnitude | None:
     """Return the best n / d of one order above the targets, positive on the whole axis, of a ratio below gamma."""
     knots, cuts = np.exp(_bends(tau, np.log(targets), order)), np.zeros(0)
     for _ in range(MAGNITUDE.rounds):
@@ -180,7 +177,7 @@ def _best(tau: Array, targets: Array, order: int, gamma: float) -> RationalMagni
     return None
 
 
-def _bends(tau: Array, log: Array, count: int) -> Array:
+def _bends(tau: AnyArray, log: AnyArray, count: int) -> AnyArray:
     """Return log tau, shape (count,), half as dense as log magnitudes bend over log tau, half evenly spaced."""
     inside = (tau > 0) & (tau < MAGNITUDE.highest)
     if inside.sum() < 3:
@@ -196,14 +193,14 @@ def _bends(tau: Array, log: Array, count: int) -> Array:
 class _Grid:
     """Squared magnitudes f to stay above, with the basis evaluated there."""
 
-    targets: Array  # (n_points,)
-    knots: Array  # (order,)
-    phi: Array  # (n_points, order + 1)
-    edge: Array  # (n_edges, order + 1): rows that keep n and d from falling at DC, Nyquist and cuts
-    nearest: Array  # (n_edges,): grid points next to these
+    targets: AnyArray  # (n_points,)
+    knots: AnyArray  # (order,)
+    phi: AnyArray  # (n_points, order + 1)
+    edge: AnyArray  # (n_edges, order + 1): rows that keep n and d from falling at DC, Nyquist and cuts
+    nearest: AnyArray  # (n_edges,): grid points next to these
 
     @classmethod
-    def of(cls, tau: Array, targets: Array, knots: Array, cuts: Array) -> _Grid:
+    def of(cls, tau: AnyArray, targets: AnyArray, knots: AnyArray, cuts: AnyArray) -> _Grid:
         """Evaluate the basis on a grid."""
         phi = basis(tau, knots)
         nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
@@ -228,7 +225,7 @@ class _Grid:
             gamma, scale, settled = spread, d, spread < MAGNITUDE.exact
         return best
 
-    def _solved(self, scale: Array, gamma: float) -> tuple[Array, Array] | None:
+    def _solved(self, scale: AnyArray, gamma: float) -> tuple[AnyArray, AnyArray] | None:
         """Minimise t over (a, b, t); return a and b."""
         from scipy.optimize import linprog
 
@@ -250,7 +247,7 @@ class _Grid:
         return (solved.x[:size] * unit[:size], solved.x[size:-1] * unit[size:-1]) if solved.status == 0 else None
 
 
-def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:
+def _check_magnitude(magnitude: ArrayLike, freqs: AnyArray) -> AnyArray:
     """Return magnitudes with a relative floor."""
     values = np.asarray(magnitude, float)
     if values.shape != freqs.shape:
@@ -270,11 +267,11 @@ _ROUNDING = 4096 * EPS
 class RationalMagnitude:
     """Squared magnitude `n / d` in tau."""
 
-    numerator: Array  # (order + 1,): coefficients a
-    denominator: Array  # (order + 1,): coefficients b
-    knots: Array  # (order,): the tau_k
+    numerator: AnyArray  # (order + 1,): coefficients a
+    denominator: AnyArray  # (order + 1,): coefficients b
+    knots: AnyArray  # (order,): the tau_k
 
-    def __call__(self, tau: npt.ArrayLike) -> Array:
+    def __call__(self, tau: ArrayLike) -> AnyArray:
         """Return the squared magnitude, shape of `tau`; infinity (Nyquist) is allowed."""
         phi = basis(np.asarray(tau, float), self.knots)
         return (phi @ self.numerator) / (phi @ self.denominator)
@@ -303,7 +300,7 @@ class RationalMagnitude:
         return Sections.of_roots(float(np.log(ends[0]) / 2), zeros, poles)
 
 
-def basis(tau: Array, knots: Array) -> Array:
+def basis(tau: AnyArray, knots: AnyArray) -> AnyArray:
     """Return phi, shape (..., order + 1)."""
     with np.errstate(divide="ignore"):
         up = 1.0 / (1.0 + knots / tau[..., None])
@@ -314,7 +311,7 @@ def basis(tau: Array, knots: Array) -> Array:
     return rising * falling
 
 
-def roots(coefficients: Array, knots: Array) -> Sequence[complex]:
+def roots(coefficients: AnyArray, knots: AnyArray) -> Sequence[complex]:
     """Return the roots in tau of `sum a_k phi_k`, whose first and last coefficients are not zero."""
     import mpmath
 

@@ -23,19 +23,17 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.frequency import nyquist_hz
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ..forms import OUTPUT_SIDE, Form, change_of, loop_of, residual_of
 from ..settings import PROOF
 
-Array = npt.NDArray[Any]
-Ratio = Callable[[Array], Array]
+Ratio = Callable[[AnyArray], AnyArray]
 
 _LOG = logging.getLogger(__name__)
 
@@ -61,7 +59,7 @@ class Certificate:
         return self.peak * (1 + PROOF.margin)
 
 
-def certify(ratio: Ratio, freqs_hz: Array, known: Array, pencils: list[Descriptor], dt: float) -> Certificate:
+def certify(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray, pencils: list[Descriptor], dt: float) -> Certificate:
     """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, by level sets if possible."""
     freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))
     if not pencils or peak <= 0 or not _trusted(pencils, freqs_hz, known, dt):
@@ -76,7 +74,7 @@ def certify(ratio: Ratio, freqs_hz: Array, known: Array, pencils: list[Descripto
     return Certificate(Method.GRID, peak, freq)
 
 
-def _sharpened(ratio: Ratio, freqs_hz: Array, known: Array) -> tuple[float, float]:
+def _sharpened(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray) -> tuple[float, float]:
     """Return frequency and height of the highest peak, searched for between its neighbours."""
     from scipy.optimize import minimize_scalar
 
@@ -86,21 +84,21 @@ def _sharpened(ratio: Ratio, freqs_hz: Array, known: Array) -> tuple[float, floa
     return max((float(freqs_hz[top]), float(known[top])), (float(best.x), -float(best.fun)), key=lambda peak: peak[1])
 
 
-def _crossings_hz(pencil: Descriptor, gamma: float, dt: float) -> Array:
+def _crossings_hz(pencil: Descriptor, gamma: float, dt: float) -> AnyArray:
     """Return the frequencies, Hz, at which a singular value may equal gamma."""
     s = pencil.crossings(gamma)
     near = s[(np.abs(s.real) <= PROOF.near * np.abs(s)) & (s.imag > 0)].imag
     return np.unique(np.arctan(near) / (np.pi * dt))
 
 
-def _candidates(pencil: Descriptor, gamma: float, dt: float) -> Array:
+def _candidates(pencil: Descriptor, gamma: float, dt: float) -> AnyArray:
     """Return the crossings of a level and points between them."""
     points = _crossings_hz(pencil, gamma, dt)
     ends = np.concatenate([[0.0], points, [nyquist_hz(dt)]])
     return np.concatenate([ends, (ends[1:] + ends[:-1]) / 2, np.sqrt(points[1:] * points[:-1])])
 
 
-def _trusted(pencils: list[Descriptor], freqs_hz: Array, known: Array, dt: float) -> bool:
+def _trusted(pencils: list[Descriptor], freqs_hz: AnyArray, known: AnyArray, dt: float) -> bool:
     """Tell whether the pencil of the worst unit has an eigenvalue at every crossing that the grid shows."""
     unit = int(known.max(axis=1).argmax())
     level = PROOF.probe * float(known[unit].max())
@@ -118,11 +116,11 @@ def _trusted(pencils: list[Descriptor], freqs_hz: Array, known: Array, dt: float
 class Descriptor:
     """`s F x = A x + B u, y = C x + D u`."""
 
-    F: Array
-    A: Array
-    B: Array
-    C: Array
-    D: Array
+    F: AnyArray
+    A: AnyArray
+    B: AnyArray
+    C: AnyArray
+    D: AnyArray
 
     @classmethod
     def of(cls, system: StateSpace) -> Descriptor:
@@ -173,7 +171,7 @@ class Descriptor:
         C = np.hstack([np.zeros((m, 2 * n)), np.eye(m)])
         return Descriptor(np.diag(np.repeat([1.0, 0.0], [2 * n, m])), A, B, C, np.zeros((m, p)))
 
-    def crossings(self, gamma: float) -> Array:
+    def crossings(self, gamma: float) -> AnyArray:
         r"""Return the s at which a singular value may equal gamma.
 
         They are the finite eigenvalues of
@@ -188,18 +186,18 @@ class Descriptor:
         left = np.block([[self.A, np.zeros((n, n)), self.B], *below])
         return _eigenvalues(left, _diagonal(self.F, self.F.T, np.zeros((m, m))))
 
-    def poles(self) -> Array:
+    def poles(self) -> AnyArray:
         """Return the finite eigenvalues of the pencil."""
         return _eigenvalues(self.A, self.F)
 
 
-def _diagonal(*blocks: Array) -> Array:
+def _diagonal(*blocks: AnyArray) -> AnyArray:
     from scipy.linalg import block_diag
 
     return np.asarray(block_diag(*blocks), float)
 
 
-def _eigenvalues(left: Array, right: Array) -> Array:
+def _eigenvalues(left: AnyArray, right: AnyArray) -> AnyArray:
     """Return the finite eigenvalues of a pencil whose rows and columns are brought to sizes near one."""
     from scipy.linalg import eigvals
 
@@ -238,7 +236,7 @@ class ResidualSystems:
         parts = [after @ part @ before for part in self]
         return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= PROOF.rows else []
 
-    def modes_hz(self, grid_hz: Array) -> Array:
+    def modes_hz(self, grid_hz: AnyArray) -> AnyArray:
         """Return frequencies of modes of residuals and plants that a grid from DC to Nyquist passes over."""
         dt = self.nominal.dt
         plants = (self.nominal, *(self.units[k] for k in range(self.units.batch_shape[0])))

@@ -15,15 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from ...core.arrays import AnyArray
 from ...core.lti import StateSpace, gain
 from ..settings import MAGNITUDE
-
-Array = npt.NDArray[Any]
 
 _FLOAT = np.finfo(float)
 
@@ -32,12 +29,12 @@ _FLOAT = np.finfo(float)
 class Sections:
     """Magnitudes, one for every entry of a weight."""
 
-    level: Array  # (entry,), nepers: log magnitude at DC
-    entry: Array  # (section,): the entry that a section belongs to
-    sign: Array  # (section,): 1 for zeros, -1 for poles
-    pair: Array  # (section,): whether it is of second order
-    corner: Array  # (section,): x
-    width: Array  # (section,): y; of no effect in sections of first order
+    level: AnyArray  # (entry,), nepers: log magnitude at DC
+    entry: AnyArray  # (section,): the entry that a section belongs to
+    sign: AnyArray  # (section,): 1 for zeros, -1 for poles
+    pair: AnyArray  # (section,): whether it is of second order
+    corner: AnyArray  # (section,): x
+    width: AnyArray  # (section,): y; of no effect in sections of first order
 
     @classmethod
     def of_roots(cls, level: float, zeros: Sequence[complex], poles: Sequence[complex]) -> Sections:
@@ -56,22 +53,22 @@ class Sections:
         return cls(np.concatenate([part.level for part in parts]), entry, *rest)
 
     @property
-    def orders(self) -> Array:
+    def orders(self) -> AnyArray:
         """Order of every entry."""
         poles = self.sign < 0
         return np.bincount(self.entry[poles], 1 + self.pair[poles], minlength=len(self.level)).astype(int)
 
     @property
-    def owner(self) -> Array:
+    def owner(self) -> AnyArray:
         """Entry of every parameter: levels, corners, widths of pairs."""
         return np.concatenate([np.arange(len(self.level)), self.entry, self.entry[self.pair]])
 
     @property
-    def parameters(self) -> Array:
+    def parameters(self) -> AnyArray:
         """Return levels, corners and widths of pairs."""
         return np.concatenate([self.level, self.corner, self.width[self.pair]])
 
-    def logs(self, tau: Array) -> Array:
+    def logs(self, tau: AnyArray) -> AnyArray:
         """Return log magnitudes, nepers, shape (entry, frequency)."""
         total = np.repeat(self.level[:, None], len(tau), axis=1)
         u, q = self._variables(tau)
@@ -79,7 +76,7 @@ class Sections:
         np.add.at(total, self.entry, logs * (self.sign / 2)[:, None])
         return total
 
-    def slopes(self, tau: Array) -> Array:
+    def slopes(self, tau: AnyArray) -> AnyArray:
         """Return derivatives of the owner's log magnitude, shape (parameter, frequency)."""
         u, q = self._variables(tau)
         share, half = u / (1 + u), (self.sign / 2)[:, None]
@@ -88,7 +85,7 @@ class Sections:
         by_width = (extra * v / q)[self.pair]
         return np.vstack([np.ones((len(self.level), len(tau))), -half * by_corner, half[self.pair] * by_width])
 
-    def at(self, parameters: Array, ends: tuple[float, float]) -> Sections:
+    def at(self, parameters: AnyArray, ends: tuple[float, float]) -> Sections:
         """Return sections of other parameters, corners kept within ends."""
         level, corner, pairs = np.split(parameters, [len(self.level), len(self.level) + len(self.corner)])
         width = self.width.copy()
@@ -114,7 +111,7 @@ class Sections:
             system = _section(2 * q / (1 - q), 2 * p / (1 - p), factor, dt) @ system  # from w to zeta, nothing cancels
         return system
 
-    def _roots(self, entry: int, sign: float) -> list[Array]:
+    def _roots(self, entry: int, sign: float) -> list[AnyArray]:
         """Return the roots in w of every section, pairs first."""
         rows = np.flatnonzero((self.entry == entry) & (self.sign == sign))
         roots = []
@@ -125,7 +122,7 @@ class Sections:
             roots.append(-size * np.array([large, 1 / large] if self.pair[k] else [1.0 + 0j]))
         return roots
 
-    def _variables(self, tau: Array) -> tuple[Array, Array]:
+    def _variables(self, tau: AnyArray) -> tuple[AnyArray, AnyArray]:
         u = np.minimum(tau, np.cbrt(_FLOAT.max)) * np.exp(-self.corner)[:, None]
         return u, np.maximum(1 + (np.exp(self.width)[:, None] - 4) * u / (1 + u) ** 2, _FLOAT.tiny)
 
@@ -141,7 +138,7 @@ def _paired(roots: Sequence[complex]) -> list[tuple[bool, float, float]]:
     return rows + [(True, np.log(a * b), np.log((a + b) ** 2 / (a * b))) for a, b in pairs]
 
 
-def _section(q: Array, p: Array, factor: float, dt: float) -> StateSpace:
+def _section(q: AnyArray, p: AnyArray, factor: float, dt: float) -> StateSpace:
     """Section `factor (zeta - q) / (zeta - p)` of first or second order."""
     if len(p) == 1:
         step = float(np.real(p[0] - q[0]))

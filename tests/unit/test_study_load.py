@@ -9,7 +9,7 @@ from kros.core.errors import ConfigError
 from kros.data import split_episodes
 from kros.identify.survey import RecordingFacts
 from kros.lifting import Lifting
-from kros.observer import Observer
+from kros.observer import EstimatorSettings, Observer
 from kros.plants import HarmonicDrivePopulation
 from kros.report.figures.load import load_torque
 from kros.study.config import LoadConfig
@@ -26,7 +26,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
     train, test = (tuple(k for s in splits for k in getattr(s, part)) for part in ("train", "test"))
     facts = RecordingFacts("noload", dict.fromkeys(population.unit_ids, "population"), train, test, {})
     return SimpleNamespace(
-        config=SimpleNamespace(load=LoadConfig(**options)),
+        config=SimpleNamespace(load=LoadConfig(**options), estimator=EstimatorSettings()),
         facts=facts,
         population=population,
         lifting=Lifting(population.states),

@@ -1,14 +1,16 @@
-"""Types of arrays, for annotations."""
+"""Types of arrays, and objects that hold arrays."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import ArrayLike as ArrayLike
 from numpy.typing import NDArray
 
+T = TypeVar("T")
 AnyArray = NDArray[Any]
 Array = NDArray[np.float64]
 Bits = NDArray[np.uint8]
@@ -16,3 +18,9 @@ Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
 Parameters = Mapping[str, ArrayLike]  # of a lifting, by name
 Whole = NDArray[np.int64]
+
+
+@dataclass_transform(frozen_default=True, eq_default=False)
+def frozen(cls: type[T]) -> type[T]:
+    """Make a class a frozen dataclass that is compared by identity: arrays have no one truth value."""
+    return dataclass(frozen=True, eq=False)(cls)

@@ -35,17 +35,6 @@ def balanced_size(A: Array) -> Array:
     return np.asarray(matrix_balance(A, permute=False, separate=True)[1][0]) if A.size else np.ones(len(A))
 
 
-def balancing(R: AnyArray, S: AnyArray, negligible: float = 0.0) -> tuple[AnyArray, AnyArray, AnyArray]:
-    """Balance the Gramians ``R R'`` and ``S S'``: left, right, ``left @ right = I``, and the Hankel singular values.
-
-    The balanced state is ``left x``. Values below a share of the largest are `negligible`.
-    """
-    U, values, Vh = np.linalg.svd(S.T @ R, full_matrices=False)
-    k = int(np.sum(values > negligible * values.max(initial=0.0)))
-    root = np.sqrt(values[:k])
-    return (U[:, :k] / root).T @ S.T, R @ Vh[:k].T / root, values[:k]
-
-
 def entries_first(matrices: AnyArray) -> AnyArray:
     """Move the matrix axes to the front: (..., p, m) to (p, m, ...), contiguous."""
     return np.ascontiguousarray(np.moveaxis(matrices, (-2, -1), (0, 1)))

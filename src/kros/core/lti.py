@@ -10,12 +10,11 @@ A, B, C, D : state-space matrices, x+ = A x + B u, y = C x + D u (dt > 0) or dx/
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .arrays import AnyArray, ArrayLike
+from .arrays import AnyArray, ArrayLike, frozen
 from .errors import DimensionError
 
 
@@ -38,7 +37,7 @@ def sampling_period(name: str, dt: Any) -> float:
     return float(dt)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class StateSpace:
     """State-space system, or a batch of them.
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, Whole
+from ..core.arrays import Array, Flags, Whole, frozen
 from ..core.errors import DataError
 from .population import EpisodeKey, Population
 from .recording import some
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class EpisodeBatch:
     """Episodes of one population, time first.
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ValidationError
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..core.artifacts import digest_of, united
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened, stamp_of
@@ -39,7 +39,7 @@ from .steps import STEPS, Signals, Step
 HEAD = 100_000  # samples whose median step is the period
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class PreparedSource:
     """Read a recording, check its time, apply the steps, check the result."""
 

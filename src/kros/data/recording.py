@@ -18,7 +18,7 @@ from typing import Any, Self
 import numpy as np
 
 from ..core import limits
-from ..core.arrays import Array, Flags, Index
+from ..core.arrays import Array, Flags, Index, frozen
 from ..core.errors import DataError
 from ..core.files import shortened
 from ..core.rounding import AGREED, ROUNDING
@@ -43,7 +43,7 @@ class CheckRule:
 CHECK = CheckRule()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Recording:
     """One episode before or between preparation steps."""
 
@@ -63,7 +63,7 @@ class Recording:
         return self.cut(0, len(self.values) - 1) if repeated else self
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Recordings:
     """Episodes of a reader, read one at a time; a format overrides `read`. Can be pickled when `places` can."""
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..core.arrays import Array, Parameters
+from ..core.arrays import Array, Parameters, frozen
 from ..core.errors import ConfigError, DataError, SynthesisError
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
@@ -44,7 +44,7 @@ class Estimator(Protocol):
         """Return estimates, shape (n_samples, batch, n)."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Baseline:
     """A baseline that was tuned or trained."""
 
@@ -135,7 +135,7 @@ def make_trained(training: TrainingSet, measured: tuple[int, ...], kind: Regress
     return Baseline(by_unit | {"": rows.fitted(kind)}, measured, rows.estimated, facts, seen=training.seen)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class MeanProfile:
     """Mean states of motions that are known by their inputs, for machines that repeat a motion."""
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..core.artifacts import plain
 from ..core.errors import ConfigError, SynthesisError
 from ..core.settings import require_kind
@@ -51,7 +51,7 @@ class DeploymentSettings:
 DEPLOYMENT = DeploymentSettings()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Designs:
     """All observers of a population."""
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import SynthesisError
 from ..core.lti import gain
@@ -110,7 +110,7 @@ class Design:
         return cls(content["name"], Observer.load(folder / "observer.json"), synthesis, content["facts"], proof)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class DesignTask:
     """One observer to design, in channels divided by their ranges."""
 

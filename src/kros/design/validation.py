@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..core.rounding import TINY
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
@@ -38,7 +38,7 @@ class TrainingSettings:
 TRAINING = TrainingSettings()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class TrainingSet:
     """Training episodes of some units, as the sensor shows them, with each unit's lifting parameters."""
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ..core.arrays import Array, Whole
+from ..core.arrays import Array, Whole, frozen
 
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ErrorSummary:
     """Errors of an estimate over a batch of episodes."""
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..identify import ModelSet, free_run
@@ -43,7 +43,7 @@ def alike(observers: Iterable[Observer], together: int = 8) -> list[list[Observe
     return [g[start : start + together] for g in groups.values() for start in range(0, len(g), together)]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Outcome:
     """What one observer, baseline or model did."""
 
@@ -61,7 +61,7 @@ class Outcome:
         return cls(summary, [pieces[i] for i in order], TrueErrors.joined(true) if true else None)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class HeldOut:
     """Held-out episodes as the sensor shows them, with lifting parameters by unit; `shown` are displayed."""
 

@@ -8,15 +8,14 @@ show it; error and lag against the truth do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.arrays import Array, Whole
+from ..core.arrays import Array, Whole, frozen
 from .errors import error_percent, error_rms
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class TrueErrors:
     """Errors of signals against truths over a batch of episodes."""
 

@@ -15,17 +15,16 @@ w : weights of the episodes, (unit, draw, episode)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array
+from ..core.arrays import AnyArray, Array, frozen
 from ..core.errors import DataError
 from ..core.linalg import qr_triangle
 from .edmd import KoopmanMatrices, edmd
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ModelSamples:
     """Models of resampled episodes around an estimate."""
 

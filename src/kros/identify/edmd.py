@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike
+from ..core.arrays import AnyArray, Array, ArrayLike, frozen
 from ..core.errors import IdentificationError
 from ..core.linalg import qr_triangle
 from ..core.lti import StateSpace
@@ -39,7 +39,7 @@ class AlphaSearch:
     points: int = 60  # frequencies at which the models of the units are compared
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class KoopmanMatrices:
     """Koopman matrices of a batch of units, A (..., n, n) and B (..., n, m).
 

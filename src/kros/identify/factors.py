@@ -20,12 +20,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Whole
+from ..core.arrays import Array, ArrayLike, Whole, frozen
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
 from ..core.rounding import ROUNDING
@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Factor:
     """Reduced data of one or more episodes, or a batch of such reductions.
 
@@ -195,7 +195,7 @@ def require_excitation(
         log.warning("%s; its column of B is that of an offset, shrunk by alpha = %g", problem, alpha)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Ranges:
     """Ranges of a model's channels."""
 

@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from ..core.arrays import frozen
 from ..core.artifacts import Storable, load_artifact, loader, save_artifact
 from ..core.errors import DataError
 from ..data.population import Population
@@ -45,7 +46,7 @@ class Stored(Mapping[str, T]):
         return len(self._places)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class EpisodeFactors(Storable):
     """Triangular factors of every training episode of one condition, free of the lifting's parameters."""
 

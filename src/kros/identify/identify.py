@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags
+from ..core.arrays import Array, Flags, frozen
 from ..core.artifacts import digest_of
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
@@ -166,7 +166,7 @@ def reduce_episodes(task: Task) -> Factor:
     return Factor.stack(factors)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _Reduced:
     """Training episodes of one condition, reduced to factors of every unit."""
 

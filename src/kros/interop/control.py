@@ -6,11 +6,11 @@ kros.core.StateSpace (a batch) ── to_control ──► control.StateSpace (a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ..core.arrays import frozen
 from ..core.errors import DataError, DimensionError, MissingDependencyError
 from ..core.lti import StateSpace
 from ..uncertainty import ResponseUncertainty, UncertainModel
@@ -23,7 +23,7 @@ except ImportError as error:
     ) from error
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class UncertaintyForControl:
     """A nominal and weights: models have ``E = left Delta right``, ``||Delta|| <= 1`` in the form.
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..core.errors import ConfigError
 
 Codes = npt.NDArray[np.int32]
@@ -24,7 +24,7 @@ FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "Abs", "sign", "
 _KINDS = ("add", "multiply", "divide", "power", *FUNCTIONS)  # in the order of loops.c
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Program:
     """Operations of some expressions; registers hold the quantities, then the constants, then results."""
 

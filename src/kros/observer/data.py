@@ -16,12 +16,12 @@ stands for the lifted inputs.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Parameters
+from ..core.arrays import Array, ArrayLike, Parameters, frozen
 from ..core.errors import ConfigError, DimensionError
 from ..core.linalg import balanced_size
 from ..core.lti import StateSpace
@@ -35,7 +35,7 @@ from .runtime import Guard, Runtime, Seen
 from .sensor import Sensors, require_measured
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ObserverData:
     """Nominal lifted model with a correction.
 

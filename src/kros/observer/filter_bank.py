@@ -23,19 +23,18 @@ by a straight line: the response r of the filters to a unit ramp was run along, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags
+from ..core.arrays import Array, Flags, frozen
 from ..core.rounding import ITERATED
 from .checked import floats
 
 _FORGOTTEN = ITERATED  # samples: an age whose square counts as nothing beside any half
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class FilterBank:
     """Start and gaps of an observer that is a filter bank."""
 

@@ -19,12 +19,11 @@ its start: while they go by, all that the monitor remembers is held.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, Flags
+from ..core.arrays import AnyArray, Array, Flags, frozen
 from ..core.errors import DataError
 from .checked import floats
 
@@ -34,7 +33,7 @@ WEIGHT = 16  # of all bands together
 QUIET = 0.01  # of its limit: a band that is more quiet says no more
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Monitor:
     """What a monitor computes with, and how often it is wrong about good machines."""
 

@@ -27,12 +27,11 @@ the correction makes the observer stable.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike, Parameters
+from ..core.arrays import AnyArray, Array, ArrayLike, Parameters, frozen
 from ..core.errors import DataError
 from ..core.rounding import TINY
 from ..data import EpisodeBatch
@@ -122,7 +121,7 @@ def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], 
     return np.einsum("ub,bfij->ufij", member / (member @ counts)[:, None], total)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ResidualModel:
     """A model for a residual-shaped observer, with what its synthesis needs."""
 

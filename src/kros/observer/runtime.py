@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..core.errors import DataError
 from .checked import floats
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Seen:
     """The largest sizes seen in training.
 
@@ -42,7 +42,7 @@ class Seen:
         floats(self, "Sizes seen in training", **dict.fromkeys(vars(self), "finite and not negative"))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Runtime:
     """Delay and limits of a running observer.
 
@@ -100,7 +100,7 @@ class Runtime:
         return np.clip(x, *self.sides(x.shape[-1]), out=out) if self.limits() else x
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Guard:
     """Bounds of an observer's states: a step beyond them is not taken, the next good sample starts it again."""
 

@@ -22,13 +22,13 @@ and a start costs no more than a start. Parameters stay.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntFlag
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Bits, Flags, Index
+from ..core.arrays import Array, ArrayLike, Bits, Flags, Index, frozen
 from ..core.errors import DimensionError
 from .data import ObserverData
 from .runtime import Seen
@@ -73,7 +73,7 @@ class SampleStatus(IntFlag):
     RESTARTED = 16
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Held:
     """Inputs held from sample to sample."""
 
@@ -87,7 +87,7 @@ class Held:
         return cls(np.zeros((batch, m)), np.full((batch, m), LONGEST + 1), np.ones(batch, dtype=bool))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Screened:
     """Samples as an observer takes them."""
 
@@ -111,7 +111,7 @@ class Screened:
         return replace(self, **{name: signal(name) for name in _SIGNALS})
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Screen:
     """Judges samples one by one; limits, and between which values a sample is plausible, of [y; u], (q + m,) each."""
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Bits, Flags, Index, Parameters
+from ..core.arrays import Array, Bits, Flags, Index, Parameters, frozen
 from ..loops import Library, formulas, library
 from .data import ObserverData
 from .monitor import judged_samples
@@ -93,7 +93,7 @@ def _run(courses: Sequence[Course], samples: Screened) -> list[Stepped]:
     return finished
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Stepped:
     """What an observer did, step by step."""
 

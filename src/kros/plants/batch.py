@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..core.errors import ConfigError
 from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Unit
 from ..data.prepare import assemble
@@ -29,7 +29,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
 T = TypeVar("T")  # true parameters, with `as_dict`, ready for JSON
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class SimulatedPopulation(Generic[T]):
     """Recordings and what is true about them.
 
@@ -100,7 +100,7 @@ class BatchSettings:
         return {n: v * float(np.exp(self.spread * dev * rng.standard_normal())) for n, (v, dev) in kinds}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class UnitTruth(ABC):
     """True parameters, each an array of shape (n_units,), and the differential equation that they belong to."""
 

@@ -11,11 +11,9 @@ exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..data.population import Channel, Role
 from .batch import Batch, UnitTruth
 
@@ -27,7 +25,7 @@ CHANNELS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class DcMotorTruth(UnitTruth):
     """True parameters of the motors."""
 

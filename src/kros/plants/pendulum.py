@@ -8,16 +8,14 @@ sensor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..data.population import Channel, Role
 from .batch import Batch, UnitTruth
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class PendulumTruth(UnitTruth):
     """True parameters of the pendulums."""
 

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from ..core.arrays import AnyArray
+from ..core.arrays import AnyArray, frozen
 from ..core.artifacts import load_artifact, read_json
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
@@ -30,7 +30,7 @@ class NotShownError(Exception):
     """A figure cannot be drawn because the run does not have what it shows; the message is the reason."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Shown:
     """One held-out episode with the estimates of observers and the predictions of models."""
 

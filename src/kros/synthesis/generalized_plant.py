@@ -8,11 +8,11 @@ K : controller with matrices A^c, B^c, C^c, D^c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ..core.arrays import AnyArray
+from ..core.arrays import AnyArray, frozen
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, real_array, sampling_period
 from ..core.rounding import SINGULAR
@@ -20,7 +20,7 @@ from ..core.rounding import SINGULAR
 _MATRICES = ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21", "D22")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class GeneralizedPlant:
     r"""Plant with weights, before the controller is connected.
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from enum import Enum
 
+from ..core.arrays import frozen
 from ..core.artifacts import Storable
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace
@@ -60,7 +60,7 @@ class Status(str, Enum):
     INACCURATE = "inaccurate"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Synthesis(Storable):
     """A verified correction filter and its certificate.
 

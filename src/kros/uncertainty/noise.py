@@ -16,12 +16,11 @@ between units.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ..core.arrays import AnyArray
+from ..core.arrays import AnyArray, frozen
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
 from ..core.linalg import sigma_max, squared
@@ -30,7 +29,7 @@ from .forms import Form, residual
 from .settings import OUTLIER
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class NoiseShare:
     """Mean squared residuals of a population and the part of them that recordings explain."""
 

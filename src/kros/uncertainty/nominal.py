@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ..core.arrays import AnyArray, ArrayLike
+from ..core.arrays import AnyArray, ArrayLike, frozen
 from ..core.linalg import sigma_max
 from ..identify.refine.minimax import smallest_largest
 from .forms import Form, as_form, check_responses, residual
 from .settings import SET
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class NominalChoice:
     """Best nominal of one form."""
 

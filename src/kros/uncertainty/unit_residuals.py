@@ -12,12 +12,11 @@ weights and designs the paper's own observer with them; its sets have diagonal w
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray
+from ..core.arrays import AnyArray, frozen
 from ..core.artifacts import Storable
 from ..core.errors import DimensionError
 from ..core.linalg import sigma_max
@@ -28,7 +27,7 @@ from .weights.cover import Cover, Weight
 from .weights.magnitude import fit_magnitude
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class UnitResiduals(Storable):
     """Sizes of the residuals of many units against one nominal."""
 
@@ -71,7 +70,7 @@ def unit_residuals(
     return UnitResiduals(*names, freqs_hz, np.abs(E), cover.ratio(E), np.abs(E[inside]).max(axis=0), *fit)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class EntryWeights:
     """Bounds of entries at frequencies."""
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.errors import DataError
 from ...core.files import shortened
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
@@ -16,7 +15,7 @@ from ..prepare import assemble
 from ..recording import Recording, Recordings, check_period, title
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ArrayRecordings(Recordings):
     """Episodes held in memory, with their times or None, columns in the order of the channels; made read-only."""
 

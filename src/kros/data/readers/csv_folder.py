@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.errors import DataError
 from ...core.files import did_you_mean, read_toml
 from ...core.settings import Settings
@@ -247,7 +247,7 @@ class FilePlace:
     piece: tuple[int, int] = (0, 1)  # of how many
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class CsvRecordings(Recordings):
     """Reads one file at a time; without `time_scale` there is no column of time."""
 

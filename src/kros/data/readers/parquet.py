@@ -22,7 +22,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.artifacts import load_artifact, save_artifact, united
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
@@ -42,7 +42,7 @@ COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED
 _ARROW_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ParquetRecordings(Recordings):
     """Reads one row group at a time; a place is a file, its row group and the number of samples."""
 

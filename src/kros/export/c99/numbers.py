@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.errors import ConfigError
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
@@ -50,7 +50,7 @@ class LoadOutput:
     current: str = "current"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Source:
     """An observer in the terms of its C source."""
 

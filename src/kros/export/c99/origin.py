@@ -13,20 +13,19 @@ single precision runs so; double precision does without.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.rounding import EPS, ITERATED, TINY
 from ...lifting import Lifting
 from ...observer.data import ObserverData
 from .realise import RULE
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class OriginShift:
     """How an observer's signals move with the origin."""
 

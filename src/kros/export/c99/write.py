@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.arrays import AnyArray, Array
+from ...core.arrays import AnyArray, Array, frozen
 from ...core.artifacts import json_bytes, with_checksum
 from ...core.files import whole_folder, write_bytes
 from ...observer import Observer
@@ -152,7 +151,7 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     return -(-(8 * doubles + real * reals + 4 * words) // align) * align
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Golden:
     """Samples and what becomes of them."""
 

@@ -12,11 +12,11 @@ which is quadratic below `level`; a power above one flattens the residual's peak
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array
+from ...core.arrays import AnyArray, Array, frozen
 from ...core.linalg import adjoint, entries_first, multiply, sigma_max_first
 from .minimax import smallest_largest
 
@@ -26,7 +26,7 @@ def unit_circle(points: int, decades: int = 6) -> AnyArray:
     return np.asarray(np.exp(1j * np.pi * np.logspace(-decades, 0, points)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ResponsePrior:
     """Prior that keeps frequency responses near that of the pooled model."""
 

@@ -21,11 +21,11 @@ V : free parameters, (unit, n_lifted, p);  W = V T^T;  P = n_lifted p
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Whole
+from ...core.arrays import Array, Flags, Whole, frozen
 from ...core.rounding import TINY
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
@@ -36,7 +36,7 @@ from .segments import Segments
 from .sensitivity import Normal, normal_equations
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class OneStep:
     """Normal equations of the lifted functions' rows."""
 
@@ -73,7 +73,7 @@ class OneStep:
         return np.asarray(out / self.variance[row])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class RefinementProblem:
     """Least squares of all units at one horizon."""
 

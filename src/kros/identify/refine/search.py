@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Whole
+from ...core.arrays import Array, Flags, Whole, frozen
 from ...core.rounding import EPS, TINY
 
 Evaluate = Callable[[Array], Array]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Solution:
     """Where the search ended."""
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Flags, Whole
+from ...core.arrays import AnyArray, Array, Flags, Whole, frozen
 from ...core.errors import DataError
 from ...data.population import EpisodeKey, Population
 from ...data.prepare import scale_population
@@ -17,7 +17,7 @@ from ..factors import Factor, Ranges
 Keys = Mapping[str, Sequence[EpisodeKey]]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class TrainingData:
     """Training episodes of every unit with their factors; the units that are `pooled` speak for the population."""
 
@@ -44,7 +44,7 @@ class TrainingData:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Segments:
     """Stretches of recordings, the same number for every unit."""
 

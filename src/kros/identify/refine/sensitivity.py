@@ -19,11 +19,10 @@ normal  : ``[J r]^T [J r]`` of every unit, (unit, n p + 1, n p + 1), over the re
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from ...core.arrays import Array, Flags
+from ...core.arrays import Array, Flags, frozen
 from ...lifting import Lifting
 from ...loops import Library, formulas, library
 from .segments import Segments
@@ -32,7 +31,7 @@ Past = tuple[int, int, int]
 _AT_ONCE = 500_000  # numbers in memory: residuals and how they move
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Normal:
     """Normal equations of every unit."""
 
@@ -74,7 +73,7 @@ def normal_equations(
     return Normal(matrix, squares, segments.compared[stride - 1 :: stride].sum(axis=(0, 2)).astype(float))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _Run:
     """Free runs of all segments: models W (n, p, batch), recordings x (sample, n, batch) and u (sample, m, batch)."""
 

@@ -17,16 +17,16 @@ B. D. O. Anderson and J. B. Moore, Optimal Filtering, Prentice-Hall 1979, sectio
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters
+from ...core.arrays import Array, Parameters, frozen
 from ...core.errors import DimensionError
 from ...lifting import Lifting
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ExtendedKalman:
     """Extended Kalman filter; measured states start with the measurement's noise."""
 

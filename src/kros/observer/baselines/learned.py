@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters, Whole
+from ...core.arrays import Array, Parameters, Whole, frozen
 from ...core.errors import DataError
 from ...core.rounding import TINY
 from ...data import EpisodeBatch
@@ -32,7 +32,7 @@ class Ridge:
     rows: int = 100_000  # of all episodes together, evenly spread; neighbouring samples hardly differ
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Learned:
     """The trained estimator."""
 
@@ -54,7 +54,7 @@ class Learned:
         return estimate
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Moments:
     """Products of regressors and hidden states, summed over the episodes of every unit: a unit can be left out."""
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from ...core.arrays import Array, Parameters
+from ...core.arrays import Array, Parameters, frozen
 from ...core.errors import DataError
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
@@ -39,7 +39,7 @@ class Features:
         return np.hstack(parts)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Trained:
     """A regression of scikit-learn for every hidden state."""
 
@@ -59,7 +59,7 @@ class Trained:
         return estimate
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Rows:
     """Thinned rows of training episodes, with the unit of each."""
 

@@ -11,12 +11,12 @@ equation with multipliers proposes; what is returned was proven in exact arithme
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.artifacts import Storable
 from ...lifting.intervals import Box
 from ..data import ObserverData
@@ -52,7 +52,7 @@ class ReliftStatus(str, Enum):
     NOT_FOUND = "not_found"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ReliftCertificate(Storable):
     """What is proven about an observer at run time.
 

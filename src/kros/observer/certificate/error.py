@@ -23,11 +23,11 @@ d_k       : position of every slope in its interval
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike
+from ...core.arrays import Array, ArrayLike, frozen
 from ...core.errors import DataError, DimensionError, KrosError
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ROUNDING
@@ -44,7 +44,7 @@ class UnboundedSlopeError(KrosError):
     """A lifted function may be arbitrarily steep where the observer may be."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ReliftScales:
     """Sizes that turn a gain into a statement: errors are divided by `error`, residuals and noise by theirs.
 
@@ -95,7 +95,7 @@ class ReliftScales:
         return cls(np.ones(n), np.ones(n), np.ones(len(observer.measured)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ErrorSystem:
     """Linear part of the error dynamics with its channels, as drawn above."""
 

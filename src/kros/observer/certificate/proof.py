@@ -29,7 +29,7 @@ from itertools import product
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array
+from ...core.arrays import AnyArray, Array, frozen
 from ...core.lti import StateSpace
 from ...core.norms import first_frequencies, gramian, hinf_norm, to_continuous
 from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
@@ -53,7 +53,7 @@ _DIGITS = np.finfo(float).nmant + 1  # binary, of a number
 _BITS = 2 * _DIGITS  # of the scaled matrix that is decided on; the rounding to them is subtracted
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Proof:
     """A gain with the Lyapunov factor ``P = R'R``, shape (n, n), and multipliers, shape (n_p,)."""
 

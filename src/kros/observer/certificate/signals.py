@@ -14,13 +14,13 @@ units bounds the error for every ``sum_i a_i w_i``, ``sum_i |a_i| <= 1``, of the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Parameters, Whole
+from ...core.arrays import Array, Flags, Parameters, Whole, frozen
 from ...core.rounding import AGREED, TINY
 from ...data import EpisodeBatch
 from ...loops.filtering import recursion
@@ -35,7 +35,7 @@ from .proof import proven_gain
 _OTHERS = (0.0, 1e-3)  # weights of other states' errors: with them the Riccati equation is better conditioned
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class SignalBound:
     """Bounds on the errors of one observer at run time, in the units of measure of the batch."""
 
@@ -135,7 +135,7 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
     return gains
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Course:
     """What drove the error of an observer along recorded episodes, and the error."""
 

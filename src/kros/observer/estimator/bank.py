@@ -11,18 +11,18 @@ sample everything is taken to equal it. As a system with all delays, :math:`\xi_
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
-from ...core.arrays import Array, Whole
+from ...core.arrays import Array, Whole, frozen
 from ...core.rounding import ITERATED
 from .channels import Channels
 from .settings import EstimatorSettings
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Bank:
     """Filters of `channels` signals, the last of which is the constant one."""
 

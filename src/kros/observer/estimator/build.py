@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.errors import ConfigError
 from ...core.lti import gain
 from ...lifting import Lifting
@@ -24,7 +24,7 @@ from .regression import Design, Readout, Recordings, is_less
 from .settings import EstimatorSettings
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Identified:
     """An estimator with its readout, its family of channels, and facts for the records."""
 

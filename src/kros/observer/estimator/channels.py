@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike
+from ...core.arrays import Array, ArrayLike, frozen
 from ...lifting import Lifting
 from .settings import EstimatorSettings
 
@@ -19,7 +19,7 @@ CONSTANT = "1"
 FAMILIES = ("delays", "linear", "products", "products and random features")  # the first without lags and start
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Channels:
     """Signals that filters see: ``v = [y; sigma(y); u; gamma(u, y); 1]``, columns of the lifting."""
 

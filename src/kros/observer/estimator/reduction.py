@@ -8,11 +8,11 @@ Control 26 (1981) 17-32; L. Pernebo and L. M. Silverman, ibid. 27 (1982) 382-387
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.norms import gramian_root
 from ...core.rounding import EPS
 from ...loops import recursion
@@ -22,7 +22,7 @@ from .regression import Readout
 _EPISODES = 8
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Filters:
     """Filters with a readout: ``z+ = A z + B w``, estimate ``C z + D w``, ``z = S w`` at the first sample."""
 

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Flags, Whole
+from ...core.arrays import AnyArray, Array, Flags, Whole, frozen
 from ...core.errors import DataError
 from ...core.linalg import qr_triangle
 from ...core.rounding import EPS, ROUNDING
@@ -41,7 +41,7 @@ class Group:
     part: int
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Recordings:
     """Training episodes, read one by one.
 
@@ -123,7 +123,7 @@ def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[Who
         yield np.concatenate(parts), np.repeat([float(early), float(late)], [len(part) for part in parts])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Design:
     """A bank of channels with the recordings that it is fitted to: the rows of the regression."""
 
@@ -206,7 +206,7 @@ def interpolated(y: Array) -> Array:
     return filled
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Whitening:
     """Principal directions of the bank."""
 
@@ -231,7 +231,7 @@ class Whitening:
         return cls(directions, sigma[:count] ** -2.0, rows.T @ rows)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Moments:
     """Second moments of every group in whitened directions."""
 
@@ -293,7 +293,7 @@ class Moments:
         return {group: found[rest.tobytes()] for group, rest in known.items()}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Readout:
     """Coefficients of all states on a bank, in the channels' units, with errors on units and episodes left out."""
 

@@ -16,11 +16,9 @@ from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from .parameters import COUNT_RAD, GEAR_RATIO, SAMPLE_PERIOD_S, VELOCITY_POLE, DriveParameters, Gains
 
 SUBSTEPS = 2
@@ -95,7 +93,7 @@ def load_torque(p: DriveParameters, recorded: AnyArray) -> AnyArray:
     return p.load_inertia * acceleration + gravity
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class SimulatedSignals:
     """What a simulation leaves behind, one row per trajectory."""
 

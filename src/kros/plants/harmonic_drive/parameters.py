@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 
 GEAR_RATIO = 100
 SAMPLE_PERIOD_S = 1e-3
@@ -78,7 +78,7 @@ GAINS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class DriveParameters:
     """Physical parameters of a batch of drives; every field has the unit axis first."""
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.errors import ConfigError, DataError
 from ...core.settings import member
 from ...data import prepare
@@ -48,7 +48,7 @@ RECORDING_STREAM = 3  # first word of the spawn key of noise and offsets
 MAX_OFFSET_RAD = 0.02  # of the measured position, at the gearbox output
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Truth:
     """True parameters and signals of a simulated population."""
 

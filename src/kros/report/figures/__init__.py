@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ...core.arrays import frozen
 from ...core.errors import ConfigError
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
@@ -48,7 +49,7 @@ FIGURES: dict[str, Row] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Drawn:
     """A figure, or the reason why it is left out; `name` is also the name of its file."""
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, Flags
+from ...core.arrays import Array, Flags, frozen
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
@@ -117,7 +117,7 @@ def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, dict[str
     return scale.load(errors[1]), {}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class LoadTrial:
     """Recordings of a study with the load that is declared."""
 

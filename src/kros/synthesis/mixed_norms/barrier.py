@@ -25,12 +25,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 
 _SHRINK, _CENTRED, _STEPS = 0.3, 1.0, 400  # of mu once the decrement is below the second, and Newton steps at most
@@ -45,7 +45,7 @@ class Ending(str, Enum):
     STALLED = "no progress"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Block:
     """Matrix inequalities of one size: constant (k, d, d) and coefficients (n, k, d, d), all symmetric, k of them."""
 
@@ -61,7 +61,7 @@ class Block:
         return np.tensordot(x, self.basis, 1)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Outcome:
     """Last point that satisfies all inequalities, if any, its value, a lower bound of the optimum, and how it ended."""
 
@@ -140,7 +140,7 @@ def _follow(programme: _Programme, x: AnyArray, rtol: float, stop_below: float =
     return Outcome(x, programme.value(x), lower, ending)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _Programme:
     """``min c'x`` subject to the blocks and ``|x_i| <= box_i``, until a time of the performance counter."""
 

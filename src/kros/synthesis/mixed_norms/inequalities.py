@@ -27,16 +27,14 @@ X, Y, A_n, B_n, C_n, D_n, Z : the variables
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ...core.arrays import AnyArray
-from ...core.linalg import balancing
+from ...core.arrays import AnyArray, frozen
 from ...core.lti import StateSpace
 from ...core.norms import gramian, h2_norm
 from ...core.rounding import EPS, TINY
 from ..generalized_plant import GeneralizedPlant
+from ..riccati.equations import balancing
 from ..riccati.h2 import h2
 from .barrier import Block
 
@@ -46,7 +44,7 @@ _MARGIN = 1e-3  # least eigenvalue of the scaled Lyapunov matrices, which keeps 
 _KNOWN = 1e-3  # error, in a state's standard deviations, that stands for that of a state known exactly
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Balanced:
     """A plant in balanced coordinates, z1 divided by `size`, with the diagonal `spread` of X and Y to expect."""
 
@@ -87,7 +85,7 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     return Balanced(balanced, size, s, controls, measurements)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class MixedInequalities:
     """The inequalities of one balanced plant (D22 = 0), for any solver."""
 

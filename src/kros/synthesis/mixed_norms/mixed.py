@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from ...core.errors import ConfigError, SynthesisError
-from ...core.linalg import balancing
 from ...core.lti import StateSpace, gain
 from ...core.norms import gramian_root, h2_norm, hinf_norm
 from ...core.rounding import ITERATED
@@ -23,6 +22,7 @@ from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import mixed_plant
 from ..result import Status, Synthesis
+from ..riccati.equations import balancing
 from ..worst_case.certificate import certified
 from .barrier import Ending, minimise
 from .inequalities import MixedInequalities, balance

@@ -21,13 +21,12 @@ A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike
+from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
 _WEIGHTS = ("W_L", "W_R", "W_u", "remainder_left", "remainder_right")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ObserverProblem:
     """What an observer must be good at: a nominal model, an uncertain set around it, measurement noise.
 

@@ -15,22 +15,22 @@ mean spectrum it minimises the mean square error over the units.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Index
+from ...core.arrays import AnyArray, Array, Index, frozen
 from ...core.errors import SynthesisError
-from ...core.linalg import balancing
 from ...core.lti import StateSpace, gain
 from ...core.norms import gramian, gramian_root, h2_norm
 from ...core.rounding import ROUNDING, TINY
 from ..result import Injection, Status, Synthesis, enclosed
+from ..riccati.equations import balancing
 from ..riccati.kalman import kalman, predictor_bound
 from .shaping_filter import Basis, circle_weights, shaping_filter
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ResidualProblem:
     """Error dynamics, residuals of a population, and measurement noise."""
 
@@ -99,7 +99,7 @@ def promised_errors(problem: ResidualProblem) -> Array:
     return np.asarray(np.sqrt(shaped.unit_errors(K).mean(axis=0)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _Scaled:
     """The problem in scaled coordinates."""
 

@@ -91,3 +91,14 @@ def absorb_feedthrough(K: StateSpace, D22: AnyArray) -> StateSpace:
         raise SynthesisError("Algebraic loop: I + D^c D22 is singular; add a delay to the plant, or change D22.")
     C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
     return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)
+
+
+def balancing(R: AnyArray, S: AnyArray, negligible: float = 0.0) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Balance the Gramians ``R R'`` and ``S S'``: left, right, ``left @ right = I``, and the Hankel singular values.
+
+    The balanced state is ``left x``. Values below a share of the largest are `negligible`.
+    """
+    U, values, Vh = np.linalg.svd(S.T @ R, full_matrices=False)
+    k = int(np.sum(values > negligible * values.max(initial=0.0)))
+    root = np.sqrt(values[:k])
+    return (U[:, :k] / root).T @ S.T, R @ Vh[:k].T / root, values[:k]

@@ -18,10 +18,10 @@ from __future__ import annotations
 
 import time
 import warnings
-from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.arrays import frozen
 from ...core.errors import ConfigError, KrosError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm, hinf_norm
@@ -83,7 +83,7 @@ def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
     return _result(plant, best, lower, optimal, time.perf_counter() - start)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _Loop:
     """A controller and the recomputed norm of its closed loop; infinite where there is none or it is unstable."""
 

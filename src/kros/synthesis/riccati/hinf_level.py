@@ -20,24 +20,24 @@ K. Zhou, J. C. Doyle, K. Glover, *Robust and Optimal Control*, theorem 17.1 (pag
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import schur
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.errors import SynthesisError
-from ...core.linalg import balanced_size, balancing
+from ...core.linalg import balanced_size
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ...core.rounding import EPS, SINGULAR, TINY
 from ..generalized_plant import GeneralizedPlant, split
-from .equations import absorb_feedthrough, solve_riccati
+from .equations import absorb_feedthrough, balancing, solve_riccati
 
 _DOUBT = float(np.sqrt(EPS))  # relative: conditions that hold or fail by less than this decide nothing
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Frame:
     """The normalised continuous plant, and the way back to controllers of the plant as it was given."""
 

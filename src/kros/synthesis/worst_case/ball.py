@@ -27,11 +27,9 @@ N : (f, a, b) over f frequencies, with Delta and X (f, b, a);  M : (f, a, m);  T
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.linalg import adjoint
 from ...core.rounding import AGREED, EPS, TINY
 from ..problem.observer_problem import ObserverProblem
@@ -39,7 +37,7 @@ from ..problem.observer_problem import ObserverProblem
 _SMALL = float(np.sqrt(TINY))  # what is divided by it and squared stays finite
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Ball:
     """The set ``{X_c + R_l Theta R_r}`` over frequency, with the right factor M already multiplied in."""
 

@@ -9,17 +9,17 @@ magnitudes), so that every row and column of the residual counts alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Flags
+from ...core.arrays import AnyArray, Flags, frozen
 from ...core.linalg import entries_first, sigma_max_first, squared
 from ..forms import Form, residual
 from ..settings import OUTLIER
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Distances:
     """Distances of all units."""
 

@@ -21,13 +21,13 @@ recorded for too little are left open before (`population`). What a score would 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike
+from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.artifacts import Storable
 from ...core.errors import ConfigError, DataError
 from ..forms import Form, as_form, check_responses
@@ -37,7 +37,7 @@ from .score import Comparison, OutlierScore, Status
 from .tail import LEAST_SCORES, margins, separate
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class OutlierModel(Storable):
     """Responses of the inliers of a population, against which units are scored.
 

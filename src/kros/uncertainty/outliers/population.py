@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.work import Work
 from ...identify import Factor, ModelSet, combine
 from ...identify.factors import lifted_factor
@@ -83,7 +83,7 @@ def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: fl
     return row | {"episodes": episodes, "recorded_s": recorded_s, "needed_s": recorded_s * score.more_data}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Evidence:
     """Episodes that a unit is identified from."""
 
@@ -106,7 +106,7 @@ class Evidence:
         return Evidence(self.factor[list(episodes)], self.lifted[list(episodes)])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Recorded:
     """What a study recorded in one condition."""
 

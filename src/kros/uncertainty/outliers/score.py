@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Flags
+from ...core.arrays import AnyArray, Flags, frozen
 from ..forms import Form
 from ..settings import OUTLIER
 from .distances import Distances, scaled_levels
@@ -60,7 +60,7 @@ class OutlierScore:
     more_data: float = 1.0  # how many times as long the unit would have to be recorded; one where recordings suffice
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Comparison:
     """Units and their distances; units are scored against the inliers among them.
 

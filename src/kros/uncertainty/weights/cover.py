@@ -19,11 +19,9 @@ Weights are stable systems that are above a cover, `E_k = W_L Delta_k W_R` with 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike
+from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.linalg import entries_first, multiply, sigma_max_first, squared
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, TINY
@@ -33,7 +31,7 @@ from .proof import Method
 _STEP = np.cbrt(EPS)  # nepers, of differences
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Cover:
     """Magnitudes of a cover; one right entry is one at every frequency: the scale between left and right is free."""
 
@@ -54,7 +52,7 @@ class Cover:
         return sigma_max_first(entries_first(E) * left[:, None, None, :] * right[None, :, None, :])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Weight:
     """Stable, minimum-phase diagonal weights that cover a set of residuals."""
 
@@ -102,7 +100,7 @@ def _descend(first: AnyArray, p: int) -> AnyArray:
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _Smooth:
     """The smoothed cost of residuals (p', m', unit, frequency)."""
 

@@ -8,12 +8,12 @@ for the systems as returned (`proof`); at last the left weight is scaled until i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.frequency import bilinear_squared, nyquist_hz
 from ...core.lti import StateSpace, block_diagonal, gain
 from ..forms import Form, completion, residual
@@ -150,7 +150,7 @@ def _peaks(ratio: AnyArray) -> AnyArray:
     return np.sort(tops[np.argsort(-ratio[tops])[: PROOF.worst]])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Residuals:
     """Residuals of scaled units against a nominal, or remainders of the form, as functions of frequency, Hz."""
 

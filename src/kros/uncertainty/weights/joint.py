@@ -17,13 +17,13 @@ vectors, `d log sigma = -sum |u_i|^2 d log W_L,i - sum |v_j|^2 d log W_R,j`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.rounding import TINY
 from ..settings import FIT
 from .cover import Cover
@@ -33,7 +33,7 @@ from .sections import Sections
 NEPER_DB = 20 / np.log(10.0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class JointProblem:
     """Residuals of units at frequencies, and the cost that is to be met there."""
 
@@ -61,7 +61,7 @@ class JointProblem:
         return float(inner.min(initial=0.0)) - decades, float(inner.max(initial=-decades)) + decades
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class JointFit:
     """Sections that are sound for a problem, and the largest excess of their cost, dB."""
 
@@ -102,7 +102,7 @@ def refit(problem: JointProblem, start: Sections) -> JointFit:
     return state.fitted()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _Terms:
     """Terms under one smoothed maximum: values, frequencies, and how much every entry moves each."""
 
@@ -118,7 +118,7 @@ class _Terms:
         return self.price * (top + temperature * float(np.log(weight.sum()))), weight / weight.sum()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _State:
     """Sections, and what they give at every frequency."""
 

@@ -30,13 +30,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, pairwise
 
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike
+from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
@@ -47,7 +46,7 @@ from .sections import Sections
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class FittedMagnitude:
     """A system whose magnitude bounds data."""
 
@@ -123,7 +122,7 @@ def fit_magnitude(
     return best
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Bound:
     """Best bound of one order."""
 
@@ -189,7 +188,7 @@ def _bends(tau: AnyArray, log: AnyArray, count: int) -> AnyArray:
     return np.interp((np.arange(count) + 0.5) / count * share[-1], share, middle)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class _Grid:
     """Squared magnitudes f to stay above, with the basis evaluated there."""
 
@@ -263,7 +262,7 @@ def _check_magnitude(magnitude: ArrayLike, freqs: AnyArray) -> AnyArray:
 _ROUNDING = 4096 * EPS
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class RationalMagnitude:
     """Squared magnitude `n / d` in tau."""
 

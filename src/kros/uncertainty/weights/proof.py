@@ -26,7 +26,7 @@ from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.frequency import nyquist_hz
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
@@ -112,7 +112,7 @@ def _trusted(pencils: list[Descriptor], freqs_hz: AnyArray, known: AnyArray, dt:
     return bool(seen.all())
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Descriptor:
     """`s F x = A x + B u, y = C x + D u`."""
 
@@ -212,7 +212,7 @@ def _eigenvalues(left: AnyArray, right: AnyArray) -> AnyArray:
     return np.asarray(values[np.isfinite(values)])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class ResidualSystems:
     """The discrete systems behind residuals, scaled as these are; units with the unit axis first."""
 

@@ -14,18 +14,18 @@ Sums of logarithms keep their precision over any number of decades. The systems 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.lti import StateSpace, gain
 from ..settings import MAGNITUDE
 
 _FLOAT = np.finfo(float)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Sections:
     """Magnitudes, one for every entry of a weight."""
 

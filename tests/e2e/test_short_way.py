@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from kros.data import write_parquet
 from kros.design import Design
 from kros.design.methods import suitable
 from kros.observer import Observer
-from kros.plants import PLANTS
+from kros.plants import PLANTS, PendulumPopulation
 from kros.study import load_config
 from kros.study import run as run_study
 from kros.uncertainty import UncertainModels
@@ -75,7 +76,7 @@ def write_csv(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def example(few_figures: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """Run the README's lines in an empty folder, and stay there."""
+    """Run the README's lines in an empty folder, on fewer and shorter recordings, and stay there."""
     folder = tmp_path_factory.mktemp("short")
     code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert code is not None
@@ -83,6 +84,7 @@ def example(few_figures: None, tmp_path_factory: pytest.TempPathFactory) -> Iter
     names: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        patch.setattr("kros.plants.PendulumPopulation", partial(PendulumPopulation, 4, 4, 6.0))
         for name, fewer in FEWER.items():
             module, _, attribute = name.rpartition(".")
             patch.setattr(import_module(f"kros.{module}"), attribute, fewer)

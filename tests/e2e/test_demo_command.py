@@ -14,19 +14,8 @@ FAST = (
 
 def test_the_demo_command_runs_everything_and_says_where_the_report_is(kros, tmp_path, monkeypatch):
     out = tmp_path / "demo"
-    options = [
-        "--out",
-        out,
-        "--units",
-        3,
-        "--episodes",
-        2,
-        "--seconds",
-        5,
-        "--workers",
-        1,
-        *(part for key in FAST for part in ("--set", key)),
-    ]
+    size = ("--units", 3, "--episodes", 2, "--seconds", 5)
+    options = ["--out", out, *size, "--workers", 1, *(part for key in FAST for part in ("--set", key))]
     result = kros("demo", *options)
     assert result.exit_code == 0, result.output
     assert f"report: {out / 'report.html'}" in result.stdout

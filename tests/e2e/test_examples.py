@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("few_figures")
 # EDMD models and one method, at few frequencies: the rest is most of the time, and tests of other studies do it.
 QUICK = ["identify.refine=false", 'synthesis.methods=["residual_h2"]', "uncertainty.n_freqs=50"]
 LEARNED, OPEN = (f'observer.baselines=["open_loop"{more}]' for more in (', "learned"', ""))

@@ -130,7 +130,7 @@ def test_a_study_of_arrays_of_a_folder_and_of_a_file_is_the_same(few_figures: No
     population = kros.read(folder / "recordings", mapping=folder / "mapping.toml")
     quick: dict[str, Any] = {
         "identify": {"refine": False},
-        "uncertainty": {"n_freqs": 60},
+        "uncertainty": {"n_freqs": 60, "form": "additive"},
         "synthesis": {"methods": []},
         "observer": {"baselines": ["open_loop", "kalman_tuned"]},
     }

@@ -35,7 +35,7 @@ def kros() -> Callable[..., Result]:
 def recorded(kros, tmp_path_factory) -> Path:
     """Simulated recordings: five units and an outlier, two conditions, four short episodes."""
     out = tmp_path_factory.mktemp("recorded") / "recordings"
-    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 12, "--outlier")
+    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 9, "--outlier")
     assert result.exit_code == 0, result.output
     return out
 

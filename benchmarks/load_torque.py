@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from load_baselines import disturbance_observer, load_direction, ripple_power
 
 from kros.data import EpisodeBatch, EpisodeKey
 from kros.evaluate.errors import error_spectrum
@@ -34,9 +33,6 @@ from kros.observer.residual import one_step_residual, one_step_rows
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.parameters import COUNT_RAD
 from kros.synthesis import kalman
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-from load_baselines import disturbance_observer, load_direction, ripple_power
 
 Array = npt.NDArray[np.float64]
 LIMIT, RATIO, BAND_HZ, SLOW_HZ, REAL_HZ = 0.97, 100, (45.0, 55.0), 5.0, 20.0

@@ -26,7 +26,7 @@ LONGEST = [
     "demo",
     *(
         f"tests/e2e/test_{name}.py"
-        for name in ("examples", "short_way", "units_of_measure", "run_folder", "demo_command")
+        for name in ("examples", "short_way", "units_of_measure", "run_folder", "sampling_rates")
     ),
 ]
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import runpy
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,9 @@ from typer.testing import CliRunner, Result
 
 from kros.report.figures import Drawn, draw
 from kros.report.run_folder import RunFolder
+
+# An estimator that learns from less: the keys of [estimator].
+QUICK = "rows = 6000\nsample = 2000\nfolds = 2\nparts = 2\ngap_episodes = 4\ngap_samples = 3000\npenalties = [1e-12, 1e-8, 1e-4]\n"
 
 
 @pytest.fixture(scope="session")
@@ -29,7 +35,7 @@ def kros() -> Callable[..., Result]:
 def recorded(kros, tmp_path_factory) -> Path:
     """Simulated recordings: five units and an outlier, two conditions, four short episodes."""
     out = tmp_path_factory.mktemp("recorded") / "recordings"
-    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 12, "--outlier")
+    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 9, "--outlier")
     assert result.exit_code == 0, result.output
     return out
 
@@ -38,7 +44,7 @@ def recorded(kros, tmp_path_factory) -> Path:
 def demo(kros, recorded, tmp_path_factory) -> Path:
     """A finished study, with fewer rows and points."""
     folder = tmp_path_factory.mktemp("demo")
-    quick = "[estimator]\nrows = 20000\n[uncertainty]\nn_freqs = 300\n"
+    quick = f"[estimator]\n{QUICK}[uncertainty]\nn_freqs = 120\n"
     (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{quick}')
     result = kros("run", folder / "demo.toml", "--out", folder / "run", "--workers", 1)
     assert result.exit_code == 0, result.output
@@ -64,6 +70,25 @@ def few_figures() -> Iterator[None]:
         patch.setattr("kros.report.files.draw_all", lambda run: (draw(name, run) for name in some))
         patch.setattr("kros.cli._count", lambda workers: workers or 1)
         yield
+
+
+@pytest.fixture
+def example(monkeypatch, capsys) -> Callable[..., str]:
+    """Run a script of the examples in this process; returns what it prints."""
+
+    def run(script: str, *options: Any, data: Path | None = None, fails: str | None = None) -> str:
+        monkeypatch.setitem(os.environ, "KROS_DATA", str(data)) if data else monkeypatch.delenv("KROS_DATA", False)
+        monkeypatch.setattr(sys, "argv", [script, *map(str, options)])
+        ended = None
+        try:
+            runpy.run_path(str(Path(__file__).parents[2] / "examples" / script), run_name="__main__")
+        except SystemExit as end:
+            ended = end.code or None
+        printed = capsys.readouterr()
+        assert (fails in str(ended)) if fails else ended is None, printed.err
+        return printed.out
+
+    return run
 
 
 @pytest.fixture

@@ -67,15 +67,8 @@ class Cluster:
             "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
         }
         path = os.pathsep.join((str(Path(__file__).parent), *filter(None, sys.path)))
-        command = [
-            sys.executable,
-            "-m",
-            f"distributed.cli.dask_{what}",
-            "--no-dashboard",
-            "--scheduler-file",
-            "scheduler.json",
-            *map(str, options),
-        ]
+        fixed = ("--no-dashboard", "--scheduler-file", "scheduler.json")
+        command = [sys.executable, "-m", f"distributed.cli.dask_{what}", *fixed, *map(str, options)]
         with (self.folder / f"{what}.log").open("ab") as log:
             return subprocess.Popen(
                 command, cwd=self.folder, env={**os.environ, **own, "PYTHONPATH": path}, stdout=log, stderr=log
@@ -245,14 +238,9 @@ def test_a_study_with_a_worker_killed_half_way_leaves_the_same_bytes(cluster, st
 
 def test_a_run_whose_scheduler_is_lost_says_so_and_goes_on_with_another(cluster, study, wanted, kros, tmp_path):
     address = cluster.start(1)
+    ends = Ends(cluster.scheduler)
     with pytest.raises(KrosError, match=r"connection was lost.*the same command goes on"):
-        run_study(
-            load_config(study),
-            tmp_path / "run",
-            until=Stage.IDENTIFY,
-            scheduler=address,
-            progress=Ends(cluster.scheduler),
-        )
+        run_study(load_config(study), tmp_path / "run", until=Stage.IDENTIFY, scheduler=address, progress=ends)
     again = kros("run", study, "--out", tmp_path / "run", "--until", "identify", "--scheduler", cluster.start(1))
     assert again.exit_code == 0, again.output
     assert re.search(r"read +unchanged", again.stderr)

@@ -161,8 +161,7 @@ def test_new_units_are_scored(kros, demo, recorded, tmp_path):
     """One of them has the name of a unit of the study. It makes no difference whether the study's own recordings are still there."""
     fresh = tmp_path / "new"
     assert (
-        kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code
-        == 0
+        kros("simulate", fresh, "--units", 2, "--episodes", 3, "--seconds", 8, "--seed", 77, "--outlier").exit_code == 0
     )
     assert "unit 000000" in (refused := kros("check", demo, fresh, "--workers", 1)).stderr
     assert refused.exit_code == 2

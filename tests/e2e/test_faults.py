@@ -13,7 +13,7 @@ from kros.observer import Observer, run_observer
 from kros.observer.certificate.error import error_system
 from kros.observer.screen import screened
 
-AT, GOOD = 3000, 2000
+AT, GOOD, SAMPLES = 1000, 2000, 8000
 
 
 def test_what_a_study_hands_over_forgets_faults(demo: Path) -> None:
@@ -22,7 +22,7 @@ def test_what_a_study_hands_over_forgets_faults(demo: Path) -> None:
     population = read_parquet(Path(demo, facts["recordings"]))
     n, key = len(population.states), population.episodes[0]
     values, largest = (
-        population.read(key),
+        population.read(key)[:SAMPLES],
         np.max([np.abs(population.read(k)).max(axis=0) for k in population.episodes], axis=0),
     )
     phase = PhaseCalibration.load(demo / "calibration").units[key.unit].phase_rad

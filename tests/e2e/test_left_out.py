@@ -106,17 +106,8 @@ def test_nothing_is_made_twice_and_what_is_not_asked_for_is_gone(kros, run):
     )
     made = json.loads((folder / "left_out" / "1" / "manifest.json").read_text())
     shutil.copytree(folder, folder.parent / "copy")
-    off = kros(
-        "run",
-        folder.parent / "study.toml",
-        "--out",
-        folder.parent / "copy",
-        "--until",
-        "left_out",
-        "--set",
-        "evaluate.folds=0",
-        "--json",
-    )
+    options = ("--until", "left_out", "--set", "evaluate.folds=0", "--json")
+    off = kros("run", folder.parent / "study.toml", "--out", folder.parent / "copy", *options)
     assert "left_out" not in json.loads(off.stdout)
     assert not (folder.parent / "copy" / "left_out" / "left_out.json").exists()
     assert read_json(folder / "left_out" / "1" / "manifest.json") == made

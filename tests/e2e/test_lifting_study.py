@@ -30,7 +30,7 @@ length = 5.0
 refine = false
 
 [uncertainty]
-n_freqs = 100
+n_freqs = 60
 
 [synthesis]
 methods = ["worst_case_h2"]
@@ -44,10 +44,11 @@ INPUT_FUNCTIONS = ("current[-1]*target_velocity",)
 
 
 @pytest.fixture(scope="module")
-def run(kros, recorded, tmp_path_factory):
-    """A finished study of a lifting with everything in it."""
+def run(kros, tmp_path_factory):
+    """A finished study of a lifting with everything in it, beside its recordings of three drives."""
     folder = tmp_path_factory.mktemp("lifting")
-    (folder / "study.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{LIFTING}')
+    assert kros("simulate", folder / "drives", "--units", 3, "--episodes", 3, "--seconds", 5).exit_code == 0
+    (folder / "study.toml").write_text(f'[data]\nsource = "drives"\nreader = "parquet"\n{LIFTING}')
     result = kros("run", folder / "study.toml", "--out", folder / "run", "--until", "evaluate", "--workers", 1)
     assert result.exit_code == 0, result.output
     return folder / "run"
@@ -63,7 +64,7 @@ def test_models_carry_the_whole_lifting(run):
     assert (linear.lifting.history, linear.inputs, linear.B.shape[1:]) == (0, INPUTS, (3, 2))
 
 
-def test_observers_run_with_it(run, kros, recorded, tmp_path):
+def test_observers_run_with_it(run, kros, tmp_path):
     metrics = json.loads((run / "metrics.json").read_text())
     free = metrics["models"]["koopman_edmd"]
     assert free["order"] == 10
@@ -76,11 +77,11 @@ def test_observers_run_with_it(run, kros, recorded, tmp_path):
     assert "koopman_edmd/open_loop" in made
     observer = Observer.load(run / "observers" / "koopman_edmd" / "open_loop.json")
     assert (observer.inputs, observer.lifting.input_functions, observer.lifting.history) == (INPUTS, INPUT_FUNCTIONS, 2)
-    result = kros("estimate", run, recorded, tmp_path / "estimates.parquet")
+    result = kros("estimate", run, run.parent / "drives", tmp_path / "estimates.parquet")
     assert result.exit_code == 0, result.output
     assert len(pq.read_table(tmp_path / "estimates.parquet")) > 0
-    result = kros("check", run, recorded)
-    assert result.exit_code == 4, result.output  # of seven units none can be told from the others
+    result = kros("check", run, run.parent / "drives", "--workers", 1)
+    assert result.exit_code == 4, result.output  # of three units none can be told from the others
 
 
 def machines(n_samples):

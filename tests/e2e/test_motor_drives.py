@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -47,19 +45,11 @@ def test_claims_are_those_of_the_run(claims, metrics):
     assert ratio < 0
 
 
-def test_the_study_begins_on_simulated_drives(tmp_path):
-    small = ["--units", "2", "--episodes", "2", "--seconds", "5", "--until", "identify", "--workers", "1"]
-    command = [sys.executable, EXAMPLE / "run.py", "--out", tmp_path / "run", *small]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "run" / "models" / "koopman_edmd" / "model.json").is_file()
-    command = [
-        *command[:3],
-        tmp_path / "again",
-        "--recordings",
-        tmp_path / "run-recordings",
-        "--until",
-        "read",
-    ]  # as published ones
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+def test_the_study_begins_on_simulated_drives(example, tmp_path):
+    small = ["--units", 2, "--episodes", 2, "--seconds", 5, "--set", "identify.refine=false"]
+    script, run = "motor_drives/run.py", tmp_path / "run"
+    example(script, "--out", run, *small, "--until", "identify", "--workers", 1)
+    assert (run / "models" / "koopman_edmd" / "model.json").is_file()
+    published = ["--recordings", tmp_path / "run-recordings"]
+    example(script, "--out", tmp_path / "again", *published, "--until", "read", "--workers", 1)
+    assert (tmp_path / "again" / "population" / "facts.json").is_file()

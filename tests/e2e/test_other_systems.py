@@ -24,7 +24,7 @@ def pendulums(kros, tmp_path_factory):
         '[data]\nsource = "recordings"\nreader = "parquet"\n'
         '[lifting]\nfunctions = ["sin(position)"]\n'
         "[identify]\nrefine = true\n"
-        "[uncertainty]\nn_freqs = 200\n"
+        "[uncertainty]\nn_freqs = 80\n"
         '[synthesis]\nmethods = ["worst_case_h2"]\n'
         '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
     )

@@ -14,7 +14,7 @@ import pytest
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
 # the study of the page takes a minute; what it does is the same
 QUICKER = ["identify.refine=false", 'synthesis.methods=["worst_case_h2"]', 'observer.baselines=["open_loop"]']
-QUICKER += ["estimator.rows=20000", "uncertainty.n_freqs=60"]
+QUICKER += ["estimator.rows=4000", "estimator.gap_episodes=4", "uncertainty.n_freqs=60"]
 
 
 def steps() -> list[tuple[str, str]]:
@@ -27,7 +27,7 @@ def steps() -> list[tuple[str, str]]:
     return found
 
 
-def test_the_tutorial_from_csv_to_a_board(kros, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tutorial_from_csv_to_a_board(kros, few_figures, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     done = []
     for language, text in steps():

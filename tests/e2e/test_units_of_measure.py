@@ -50,7 +50,7 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
         "uncertainty": {"n_freqs": 50},
         "synthesis": {"methods": ["worst_case_h2", "residual_h2", "estimator"]},
         "sensor": {"position": {"noise": 4e-4 * factors[0]}},
-        "estimator": {"rows": 10000},
+        "estimator": {"rows": 3000, "sample": 1000, "gap_episodes": 3, "folds": 2, "parts": 2},
     }
     metrics = run_study(validate_config(raw, folder), folder / "run", until=until).metrics
     return json.loads(json.dumps(metrics)), folder / "run"
@@ -70,12 +70,18 @@ def errors(metrics):
     return found
 
 
-SCALINGS = [(180 / np.pi, 30 / np.pi, 1e3, 1e3), (1e9, 1.0, 1.0, 1.0), (1e-9, 1e9, 1e-9, 1e9)]
+SCALINGS = {"deg_rpm_mA_mV": (180 / np.pi, 30 / np.pi, 1e3, 1e3), "mixed": (1e-9, 1e9, 1e-9, 1e9)}
 
 
-@pytest.mark.parametrize("factors", SCALINGS, ids=["deg_rpm_mA_mV", "position", "mixed"])
-def test_errors_scores_and_estimates_are_the_same(motors, first, factors, tmp_path):
-    metrics, run = study(motors, factors, tmp_path)
+@pytest.fixture(scope="module", params=SCALINGS)
+def other(motors, request, tmp_path_factory):
+    """The factors, and the study in those units."""
+    factors = SCALINGS[request.param]
+    return factors, *study(motors, factors, tmp_path_factory.mktemp("other"))
+
+
+def test_errors_scores_and_estimates_are_the_same(motors, first, other):
+    factors, metrics, run = other
     one, one_run = first
     expected, found = errors(one), errors(metrics)
     assert "filtered_difference" in {key[0] for key in found}
@@ -103,14 +109,14 @@ def test_errors_scores_and_estimates_are_the_same(motors, first, factors, tmp_pa
     np.testing.assert_allclose(scaled[..., :3], plain[..., :3], atol=WITHIN * np.abs(plain[..., :3]).max())
 
 
-def test_models_come_back_in_the_units_of_the_recordings(motors, first, tmp_path):
-    _, run = study(motors, SCALINGS[-1], tmp_path, Stage.IDENTIFY)
-    one, other = (ModelSet.load(folder / "models" / "koopman_edmd") for folder in (first[1], run))
-    x = np.array([*SCALINGS[-1][:3], 1.0])
-    np.testing.assert_allclose(other.A * x / x[:, None], one.A, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(other.output_scale, one.output_scale * x, rtol=1e-12)
+def test_models_come_back_in_the_units_of_the_recordings(first, other):
+    factors, _, run = other
+    one, scaled = (ModelSet.load(folder / "models" / "koopman_edmd") for folder in (first[1], run))
+    x = np.array([*factors[:3], 1.0])
+    np.testing.assert_allclose(scaled.A * x / x[:, None], one.A, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(scaled.output_scale, one.output_scale * x, rtol=1e-12)
     assert one.alpha_in_ranges
-    assert one.alpha == pytest.approx(other.alpha, rel=1e-6)
+    assert one.alpha == pytest.approx(scaled.alpha, rel=1e-6)
     assert one.lifting.functions == ("tanh(1.0*velocity)",)
 
 

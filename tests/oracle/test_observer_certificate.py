@@ -26,17 +26,8 @@ from kros.synthesis import Injection
 def scalar(a: float, b: float, correction: float = 0.0) -> Observer:
     """x+ = a x + b sin(x) + u, corrected by a constant gain."""
     model = np.array([[a, b], [0.0, 0.0]])
-    return Observer(
-        "scalar",
-        Lifting(("x",), ("sin(x)",)),
-        model,
-        np.array([[1.0], [0.0]]),
-        (0,),
-        ("u",),
-        gain([[correction], [0.0]], 1.0),
-        Injection.STATE,
-        1.0,
-    )
+    lifting, B, K = Lifting(("x",), ("sin(x)",)), np.array([[1.0], [0.0]]), gain([[correction], [0.0]], 1.0)
+    return Observer("scalar", lifting, model, B, (0,), ("u",), K, Injection.STATE, 1.0)
 
 
 def random_observer(

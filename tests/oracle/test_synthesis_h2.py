@@ -1,53 +1,22 @@
 """H2 synthesis against published numbers, independent optimisation, FIR Youla programs, and closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from slicot import slicot_discrete
 
 from kros.core import gain
 from kros.synthesis import GeneralizedPlant, h2, kalman
 
 
 def random_plant(rng, n, dt, d22=True):
-    A = rng.standard_normal((n, n))
-    zero = np.zeros((4, 3))
-    return GeneralizedPlant(
-        A,
-        rng.standard_normal((n, 3)),
-        rng.standard_normal((n, 2)),
-        rng.standard_normal((4, n)),
-        rng.standard_normal((2, n)),
-        rng.standard_normal((4, 3)) if dt > 0 else zero,
-        rng.standard_normal((4, 2)),
-        rng.standard_normal((2, 3)),
-        0.1 * rng.standard_normal((2, 2)) * d22,
-        dt,
-    )
+    shapes = ((n, n), (n, 3), (n, 2), (4, n), (2, n), (4, 3), (4, 2), (2, 3))
+    return GeneralizedPlant(*map(rng.standard_normal, shapes), 0.1 * rng.standard_normal((2, 2)) * d22, dt)
 
 
 def slicot_sb10ed():
-    """Example of the SLICOT routine SB10ED (discrete H2), five inputs and outputs, two controls and measurements."""
-    A = [
-        [-0.7, 0.0, 0.3, 0.0, -0.5, -0.1],
-        [-0.6, 0.2, -0.4, -0.3, 0.0, 0.0],
-        [-0.5, 0.7, -0.1, 0.0, 0.0, -0.8],
-        [-0.7, 0.0, 0.0, -0.5, -1.0, 0.0],
-        [0.0, 0.3, 0.6, -0.9, 0.1, -0.4],
-        [0.5, -0.8, 0.0, 0.0, 0.2, -0.9],
-    ]
-    B = np.array(
-        [
-            [-1, -2, -2, 1, 0],
-            [1, 0, 1, -2, 1],
-            [-3, -4, 0, 2, -2],
-            [1, -2, 1, 0, -1],
-            [0, 1, -2, 0, 3],
-            [1, 0, 3, -1, -2],
-        ]
-    )
-    C = np.array(
-        [[1, -1, 2, -2, 0, -3], [-3, 0, 1, -1, 1, 0], [0, 2, 0, -4, 0, -2], [1, -3, 0, 0, 3, 1], [0, 1, -2, 1, 0, -2]]
-    )
-    D = np.array([[1, -1, -2, 0, 0], [0, 1, 0, 1, 0], [2, -1, -3, 0, 1], [0, 1, 0, 1, -1], [0, 0, 1, 2, 1]])
+    """Example of the SLICOT routine SB10ED (discrete H2) with its controller."""
     K = {
         "A": [
             [-0.0551, -2.1891, -0.6607, -0.2532, 0.6674, -1.0044],
@@ -68,8 +37,7 @@ def slicot_sb10ed():
         "C": [[0.2500, -1.0200, -0.3371, -0.2733, 0.2747, -0.4444], [0.0654, 0.2095, 0.0632, 0.2089, -0.1895, 0.1834]],
         "D": [[-0.2181, -0.2070], [0.1094, 0.1159]],
     }
-    plant = GeneralizedPlant(A, B[:, :3], B[:, 3:], C[:3], C[3:], D[:3, :3], D[:3, 3:], D[3:, :3], D[3:, 3:], 1.0)
-    return plant, K
+    return slicot_discrete(), K
 
 
 def test_slicot_example():
@@ -78,9 +46,7 @@ def test_slicot_example():
     for name in "ABCD":
         assert getattr(found, name) == pytest.approx(np.array(expected[name]), abs=6e-5)  # four decimals are printed
     # The feedthrough from w to z matters for a proper controller: without it the numbers are others.
-    strictly = GeneralizedPlant(
-        plant.A, plant.B1, plant.B2, plant.C1, plant.C2, 0 * plant.D11, plant.D12, plant.D21, plant.D22, 1.0
-    )
+    strictly = replace(plant, D11=0 * plant.D11)
     assert np.abs(h2(strictly).controller.A - np.array(expected["A"])).max() > 2e-4
 
 
@@ -103,20 +69,13 @@ def test_an_impulse_response_of_forty_taps_reaches_the_same_optimum():
     rng = np.random.default_rng(5)
     plant = random_plant(rng, 3, 1.0, d22=False)
     A = plant.A * (0.4 / np.abs(np.linalg.eigvals(plant.A)).max())
-    plant = GeneralizedPlant(A, plant.B1, plant.B2, plant.C1, plant.C2, plant.D11, plant.D12, plant.D21, plant.D22, 1.0)
+    plant = replace(plant, A=A)
     z = np.exp(2j * np.pi * np.arange(400) / 400)
 
-    def response(B, C, D):
-        return (
-            C @ np.linalg.solve(z[:, None, None] * np.eye(3) - A, np.broadcast_to(B, (400, *B.shape)).astype(complex))
-            + D
-        )
-
-    P11, P12, P21 = (
-        response(plant.B1, plant.C1, plant.D11),
-        response(plant.B2, plant.C1, plant.D12),
-        response(plant.B1, plant.C2, plant.D21),
-    )
+    resolvent = np.linalg.inv(z[:, None, None] * np.eye(3) - A)
+    P11 = plant.C1 @ resolvent @ plant.B1 + plant.D11
+    P12 = plant.C1 @ resolvent @ plant.B2 + plant.D12
+    P21 = plant.C2 @ resolvent @ plant.B1 + plant.D21
     columns = []
     for tap in range(40):
         delayed = z[:, None, None] ** -tap * P12
@@ -141,17 +100,9 @@ def test_kalman_scalar_closed_form_and_simulation():
 def test_continuous_lqg_against_scipy_formula():
     # Double integrator with unit weights: X = [[sqrt 3, 1], [1, sqrt 3]], and the filter is its mirror image.
     A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    B1, C1 = np.eye(2, 3), np.eye(3, 2)
     plant = GeneralizedPlant(
-        A,
-        np.hstack([np.eye(2), np.zeros((2, 1))]),
-        B,
-        np.vstack([np.eye(2), np.zeros((1, 2))]),
-        [[1.0, 0.0]],
-        np.zeros((3, 3)),
-        [[0], [0], [1.0]],
-        [[0, 0, 1.0]],
-        [[0.0]],
-        0.0,
+        A, B1, B, C1, [[1.0, 0.0]], np.zeros((3, 3)), [[0], [0], [1.0]], [[0, 0, 1.0]], [[0.0]], 0.0
     )
     K = h2(plant).controller
     assert pytest.approx(np.array([[-1.0, -np.sqrt(3)]])) == K.C

@@ -5,50 +5,11 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from scipy.linalg import null_space, solve_continuous_are, solve_discrete_are
+from slicot import partition, slicot_discrete
 
 from kros.core import StateSpace, hinf_norm
 from kros.synthesis import GeneralizedPlant, Status, h2, hinf
 from kros.synthesis.riccati.hinf_level import Frame
-
-
-def partition(A, B, C, D, n_y, n_u, dt):
-    A, B, C, D = (np.array(x, dtype=float) for x in (A, B, C, D))
-    return GeneralizedPlant(
-        A,
-        B[:, :-n_u],
-        B[:, -n_u:],
-        C[:-n_y],
-        C[-n_y:],
-        D[:-n_y, :-n_u],
-        D[:-n_y, -n_u:],
-        D[-n_y:, :-n_u],
-        D[-n_y:, -n_u:],
-        dt,
-    )
-
-
-def slicot_sb10dd():
-    """Example of the SLICOT routine SB10DD (discrete H-infinity): published level 111.294."""
-    A = [
-        [-0.7, 0.0, 0.3, 0.0, -0.5, -0.1],
-        [-0.6, 0.2, -0.4, -0.3, 0.0, 0.0],
-        [-0.5, 0.7, -0.1, 0.0, 0.0, -0.8],
-        [-0.7, 0.0, 0.0, -0.5, -1.0, 0.0],
-        [0.0, 0.3, 0.6, -0.9, 0.1, -0.4],
-        [0.5, -0.8, 0.0, 0.0, 0.2, -0.9],
-    ]
-    B = [
-        [-1, -2, -2, 1, 0],
-        [1, 0, 1, -2, 1],
-        [-3, -4, 0, 2, -2],
-        [1, -2, 1, 0, -1],
-        [0, 1, -2, 0, 3],
-        [1, 0, 3, -1, -2],
-    ]
-    C = [[1, -1, 2, -2, 0, -3], [-3, 0, 1, -1, 1, 0], [0, 2, 0, -4, 0, -2], [1, -3, 0, 0, 3, 1], [0, 1, -2, 1, 0, -2]]
-    D = [[1, -1, -2, 0, 0], [0, 1, 0, 1, 0], [2, -1, -3, 0, 1], [0, 1, 0, 1, -1], [0, 0, 1, 2, 1]]
-    return partition(A, B, C, D, 2, 2, 1.0)
-
 
 CONTINUOUS_A = [
     [-1, 0, 4, 5, -3, -2],
@@ -115,18 +76,10 @@ def coprime(A, B, C, dt):
     """Robust stabilisation of normalised coprime factors as a four-block problem: w1 at the input, w2 at the output, z
     = (y, u)."""
     n, m, p = len(A), B.shape[1], C.shape[0]
-    return GeneralizedPlant(
-        A,
-        np.hstack([B, np.zeros((n, p))]),
-        B,
-        np.vstack([C, np.zeros((m, n))]),
-        C,
-        np.block([[np.zeros((p, m)), np.eye(p)], [np.zeros((m, m + p))]]),
-        np.vstack([np.zeros((p, m)), np.eye(m)]),
-        np.hstack([np.zeros((p, m)), np.eye(p)]),
-        np.zeros((p, m)),
-        dt,
-    )
+    inputs, outputs = np.hstack([B, np.zeros((n, p)), B]), np.vstack([C, np.zeros((m, n)), C])
+    zero, one = np.zeros((p, m)), np.eye(p)
+    through = np.block([[zero, one, zero], [np.zeros((m, m + p)), np.eye(m)], [zero, one, zero]])
+    return partition(A, inputs, outputs, through, p, m, dt)
 
 
 def random_plant(rng, n, dt):
@@ -163,8 +116,7 @@ def slow_optimum(p):
 
 def test_slicot_discrete_level():
     # The example asks for 111.294, which is its optimum to all six digits.
-    plant = slicot_sb10dd()
-    found = hinf(plant)
+    found = hinf(slicot_discrete())
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(111.294, abs=1e-3)
 

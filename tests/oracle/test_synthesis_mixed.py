@@ -25,20 +25,8 @@ def two_channel(rng, n=3, size2=0.3):
     A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
     B1 = np.hstack([rng.standard_normal((n, 1)), np.zeros((n, 1)), size2 * rng.standard_normal((n, 1))])
     C1 = np.vstack([rng.standard_normal((1, n)), np.zeros((1, n)), size2 * rng.standard_normal((1, n))])
-    return GeneralizedPlant(
-        A,
-        B1,
-        rng.standard_normal((n, 1)),
-        C1,
-        rng.standard_normal((1, n)),
-        np.zeros((3, 3)),
-        [[0.0], [0.5], [0.0]],
-        [[0.0, 0.5, 0.0]],
-        [[0.0]],
-        1.0,
-        n_w1=2,
-        n_z1=2,
-    )
+    B2, C2, half = rng.standard_normal((n, 1)), rng.standard_normal((1, n)), 0.5 * np.eye(3)[1:2]
+    return GeneralizedPlant(A, B1, B2, C1, C2, np.zeros((3, 3)), half.T, half, [[0.0]], 1.0, n_w1=2, n_z1=2)
 
 
 def drive_problem(seed, injection, order):

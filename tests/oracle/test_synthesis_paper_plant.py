@@ -14,13 +14,7 @@ def test_close_solves_the_algebraic_loop():
         0.3 * rng.standard_normal((2, 1)),
         1.0,
     )
-    K = StateSpace(
-        rng.standard_normal((2, 2)),
-        rng.standard_normal((2, 2)),
-        rng.standard_normal((1, 2)),
-        rng.standard_normal((1, 2)),
-        1.0,
-    )
+    K = StateSpace(*map(rng.standard_normal, ((2, 2), (2, 2), (1, 2), (1, 2))), 1.0)
     freqs = np.array([0.01, 0.1, 0.37])
     P, k = plant.open_loop().frequency_response(freqs), K.frequency_response(freqs)
     P11, P12, P21, P22 = P[:, :2, :2], P[:, :2, 2:], P[:, 2:, :2], P[:, 2:, 2:]

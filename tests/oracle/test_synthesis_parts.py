@@ -18,16 +18,8 @@ def test_a_certificate_sees_resonances_that_a_grid_passes_over(angle):
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     A = (1 - 1e-7) * turn if np.sin(angle) > 1e-9 else np.diag([(1 - 1e-7) * np.cos(angle), 0.5])
     nominal = StateSpace(A, [[0.5], [0.2]], np.eye(2), np.zeros((2, 1)), DT)
-    case = ObserverProblem(
-        nominal,
-        [[1.0, 0.0]],
-        gain([[0.0]], DT),
-        gain([[0.0]], DT),
-        [1.0],
-        [1.0, 1.0],
-        [0.1],
-        process_noise=[0.01, 0.02],
-    )
+    none = gain([[0.0]], DT)
+    case = ObserverProblem(nominal, [[1.0, 0.0]], none, none, [1.0], [1.0, 1.0], [0.1], process_noise=[0.01, 0.02])
     nothing = gain(np.zeros((2, 1)), DT)
     value, error = certify(case, nothing)
     loop = case.error_system(nothing)

@@ -11,19 +11,9 @@ from kros.synthesis import GeneralizedPlant, Status, h2, hinf
 @pytest.mark.parametrize(("q", "sigma"), [(1.0, 1.0), (60.0, 0.1), (1e4, 1e4)])
 def test_lqg_without_guaranteed_margins(q, sigma):
     """J. C. Doyle, "Guaranteed margins for LQG regulators", IEEE Trans. Automatic Control 23 (1978) 756-757."""
-    ones = np.ones((2, 1))
-    plant = GeneralizedPlant(
-        [[1.0, 1.0], [0.0, 1.0]],
-        np.hstack([np.sqrt(sigma) * ones, np.zeros((2, 1))]),
-        [[0.0], [1.0]],
-        np.vstack([np.sqrt(q) * ones.T, np.zeros((1, 2))]),
-        [[1.0, 0.0]],
-        np.zeros((2, 2)),
-        [[0.0], [1.0]],
-        [[0.0, 1.0]],
-        [[0.0]],
-        0.0,
-    )
+    ones, A, e1, e2 = np.ones((2, 1)), [[1.0, 1.0], [0.0, 1.0]], np.eye(2)[:1], np.eye(2)[1:]
+    B1, C1 = np.sqrt(sigma) * ones @ e1, np.sqrt(q) * e1.T @ ones.T
+    plant = GeneralizedPlant(A, B1, e2.T, C1, e1, np.zeros((2, 2)), e2.T, e2, [[0.0]], 0.0)
     K = h2(plant).controller
     assert pytest.approx(-(2 + np.sqrt(4 + q)) * ones.T, rel=1e-6) == K.C
     assert pytest.approx((2 + np.sqrt(4 + sigma)) * ones, rel=1e-6) == K.B
@@ -47,18 +37,10 @@ def test_mixed_sensitivity_of_the_disturbance_process():
     ||(w_P S, K S)||_inf."""
     G, W = siso(200.0, 10.0, 0.05, 0.05), performance(1.5, 10.0, 1e-4)
     n, k = G.n_states, W.n_states
-    plant = GeneralizedPlant(
-        block_diag(G.A, W.A) - np.block([[np.zeros((n, n + k))], [W.B @ G.C, np.zeros((k, k))]]),
-        np.vstack([np.zeros((n, 1)), W.B]),
-        np.vstack([G.B, np.zeros((k, 1))]),
-        np.block([[-W.D @ G.C, W.C], [np.zeros((1, n + k))]]),
-        np.hstack([-G.C, np.zeros((1, k))]),
-        np.vstack([W.D, [[0.0]]]),
-        [[0.0], [1.0]],
-        [[1.0]],
-        [[0.0]],
-        0.0,
-    )
+    A = block_diag(G.A, W.A) - np.block([[np.zeros((n, n + k))], [W.B @ G.C, np.zeros((k, k))]])
+    B1, B2 = np.vstack([np.zeros((n, 1)), W.B]), np.vstack([G.B, np.zeros((k, 1))])
+    C1, C2 = np.block([[-W.D @ G.C, W.C], [np.zeros((1, n + k))]]), np.hstack([-G.C, np.zeros((1, k))])
+    plant = GeneralizedPlant(A, B1, B2, C1, C2, np.vstack([W.D, [[0.0]]]), [[0.0], [1.0]], [[1.0]], [[0.0]], 0.0)
     found = hinf(plant)
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(1.37, abs=6e-3)  # two decimals are printed

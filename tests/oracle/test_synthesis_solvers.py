@@ -90,73 +90,43 @@ def test_inequalities_within_a_tiny_time_limit_ends_with_a_reason():
 
 
 def test_ill_conditioned_units_are_solved_alike():
-    T = np.diag([1e7, 1e-7])
+    T, inverse = np.diag([1e7, 1e-7]), np.diag([1e-7, 1e7])
     p = plant()
-    other = replace(
-        p,
-        A=T @ p.A @ np.linalg.inv(T),
-        B1=T @ p.B1,
-        B2=T @ p.B2,
-        C1=p.C1 @ np.linalg.inv(T),
-        C2=p.C2 @ np.linalg.inv(T),
-    )
+    other = replace(p, A=T @ p.A @ inverse, B1=T @ p.B1, B2=T @ p.B2, C1=p.C1 @ inverse, C2=p.C2 @ inverse)
     assert by_inequalities(other).h2_norm == pytest.approx(by_inequalities(p).h2_norm, rel=1e-2)
 
 
 def test_states_that_nothing_reaches_or_sees_do_no_harm():
     p = plant()
-    wide = replace(
-        p,
-        A=np.diag([0.9, 0.5, 0.3]),
-        B1=np.vstack([p.B1, np.zeros((1, 3))]),
-        B2=np.vstack([p.B2, [[0.0]]]),
-        C1=np.hstack([p.C1, [[1.0], [0], [0]]]),
-        C2=np.hstack([p.C2, [[0.0]]]),
-    )
+    B1, B2 = np.vstack([p.B1, np.zeros((1, 3))]), np.vstack([p.B2, [[0.0]]])
+    C1, C2 = np.hstack([p.C1, [[1.0], [0], [0]]]), np.hstack([p.C2, [[0.0]]])
+    wide = replace(p, A=np.diag([0.9, 0.5, 0.3]), B1=B1, B2=B2, C1=C1, C2=C2)
     assert by_inequalities(wide).h2_norm == pytest.approx(by_inequalities(p).h2_norm, rel=1e-2)
 
 
+PATHOLOGICAL = {
+    "chain of delays": np.diag(np.ones(19), 1),
+    "chain of integrators": np.eye(12) + np.diag(np.ones(11), 1),
+    "poles within rounding of the circle": np.diag([1 - 1e-14, 1 + 1e-14, 0.5]),
+    "poles at both ends of the circle": np.diag([-1.0, 1.0, 0.3]),
+    "sixteen decades": np.diag([1e8, 1e-8, 0.5]),
+    "many unstable poles": 0.3 * np.random.default_rng(1).standard_normal((40, 40)),
+    "huge": np.diag([1e12, 2e12]),
+}
+
+
 def pathological(name):
-    """Plants at the edge of what can be computed: (A, size of the disturbances)."""
-    rng = np.random.default_rng(1)
-    A = {
-        "chain of delays": np.diag(np.ones(19), 1),
-        "chain of integrators": np.eye(12) + np.diag(np.ones(11), 1),
-        "poles within rounding of the circle": np.diag([1 - 1e-14, 1 + 1e-14, 0.5]),
-        "poles at both ends of the circle": np.diag([-1.0, 1.0, 0.3]),
-        "sixteen decades": np.diag([1e8, 1e-8, 0.5]),
-        "many unstable poles": 0.3 * rng.standard_normal((40, 40)),
-        "huge": np.diag([1e12, 2e12]),
-    }[name]
-    n, r = len(A), rng.standard_normal
-    return GeneralizedPlant(
-        A,
-        np.hstack([r((n, 2)), np.zeros((n, 1))]),
-        r((n, 1)),
-        np.vstack([r((2, n)), np.zeros((1, n))]),
-        r((1, n)),
-        np.zeros((3, 3)),
-        [[0], [0], [1.0]],
-        [[0, 0, 1.0]],
-        [[0.0]],
-        1.0,
-    )
+    """Plants at the edge of what can be computed."""
+    A, rng = PATHOLOGICAL[name], np.random.default_rng(2)
+    n = len(A)
+    B1, B2, C1, C2 = (rng.standard_normal(shape) for shape in ((n, 2), (n, 1), (2, n), (1, n)))
+    B1, C1, D12 = np.hstack([B1, np.zeros((n, 1))]), np.vstack([C1, np.zeros((1, n))]), [[0], [0], [1.0]]
+    return GeneralizedPlant(A, B1, B2, C1, C2, np.zeros((3, 3)), D12, [[0, 0, 1.0]], [[0.0]], 1.0)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::scipy.linalg.LinAlgWarning")
 @pytest.mark.parametrize("method", [h2, hinf])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "chain of delays",
-        "chain of integrators",
-        "poles within rounding of the circle",
-        "poles at both ends of the circle",
-        "sixteen decades",
-        "many unstable poles",
-        "huge",
-    ],
-)
+@pytest.mark.parametrize("name", PATHOLOGICAL)
 def test_nothing_hangs_and_nothing_is_returned_unverified(method, name):
     p = pathological(name)
     try:

@@ -250,15 +250,8 @@ def test_process_noise_enters_design_and_certificate():
 def test_a_design_alone_that_does_not_settle_is_refused(monkeypatch, radius, refused):
     """Nothing certifies it, so the radius of its loop is all that stands between it and its user; on the circle it
     does not settle either."""
-    case = ObserverProblem(
-        StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT),
-        [[1.0]],
-        gain([[0.1]], DT),
-        gain([[0.1]], DT),
-        [1.0],
-        [1.0],
-        [1.0],
-    )
+    nominal, tenth = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT), gain([[0.1]], DT)
+    case = ObserverProblem(nominal, [[1.0]], tenth, tenth, [1.0], [1.0], [1.0])
     module = import_module("kros.synthesis.worst_case.worst_case_h2")
     monkeypatch.setattr(module, "design", lambda *_: gain([[0.5 - radius]], DT))
     if refused:

@@ -32,13 +32,8 @@ def drive(functions=GEAR, order=2, inputs=(), gamma=(), injection=Injection.STAT
     A[:3, 3:] = 1e-3 * rng.normal(size=(3, n - 3))
     B[:3, :2], B[2, 2:] = [[0.01, 0], [0.5, 0.02], [0.01, 0]], 1e-3
     width = m if injection is Injection.INPUT else n
-    K = StateSpace(
-        0.9 * np.eye(order),
-        0.1 * rng.normal(size=(order, 1)),
-        0.01 * rng.normal(size=(width, order)),
-        0.01 * rng.normal(size=(width, 1)),
-        DT,
-    )
+    K_B, K_C, K_D = (rng.normal(size=shape) for shape in ((order, 1), (width, order), (width, 1)))
+    K = StateSpace(0.9 * np.eye(order), 0.1 * K_B, 0.01 * K_C, 0.01 * K_D, DT)
     parameters = {"phase": 0.3} if lifting.parameters else {}
     seen = Seen(np.array([1.5]), np.array([2.0, 9.0]))
     return Observer(
@@ -87,32 +82,13 @@ def filters(functions=GEAR, cut=False):
     A[6:9, 5], B[6:9, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
     start = 0.1 * rng.normal(size=(n, p + 4))
     start[:, 1:n] = 0.0  # states that are not measured are not known
-    bank = FilterBank(
-        2,
-        start,
-        np.array([0.99, 0.9, 0.5]),
-        np.array([5.0, 8.0, 2.0]),
-        np.array([0.8, 0.9, 0.99]),
-        np.array([0.05]),
-    )
+    ages = ([0.99, 0.9, 0.5], [5.0, 8.0, 2.0], [0.8, 0.9, 0.99], [0.05])
+    bank = FilterBank(2, start, *map(np.array, ages))
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((p, 0)), np.zeros((p, 1)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))
     runtime = Runtime(0, low, high) if cut else Runtime()
-    return Observer(
-        "filters",
-        lifting,
-        A,
-        B,
-        (0,),
-        ("target", "rate"),
-        none,
-        Injection.STATE,
-        DT,
-        {"phase": 0.3} if functions else {},
-        runtime,
-        Seen(np.array([1.5]), np.array([2.0, 9.0])),
-        bank=bank,
-    )
+    parts = (lifting, A, B, (0,), ("target", "rate"), none, Injection.STATE, DT, {"phase": 0.3} if functions else {})
+    return Observer("filters", *parts, runtime, Seen(np.array([1.5]), np.array([2.0, 9.0])), bank=bank)
 
 
 def unequal(observer, modes=True):

@@ -6,6 +6,7 @@ import csv
 import json
 import shutil
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -94,24 +95,39 @@ def with_holes(values: np.ndarray) -> np.ndarray:
 
 
 def table(path: Path) -> tuple[list[str], np.ndarray]:
+    """The names of all columns, and the estimates and what is followed."""
     with path.open() as file:
-        rows = list(csv.reader(file))
-    return rows[0], np.array([row[4:] for row in rows[1:]], dtype=float)
+        names, *rows = csv.reader(file)
+    wanted = [i for i, name in enumerate(names) if "_hat" in name or name.startswith("phase")]
+    return names, np.array([[row[i] for i in wanted] for row in rows], dtype=float)
 
 
 def test_csv_and_parquet_say_the_same_with_units_and_sources(kros, demo, field, tmp_path, machines) -> None:
     data, columns = field(), ["position_hat", "velocity_hat", "current_hat"]
     for out in ("x.csv", "x.parquet"):
-        result = kros("estimate", demo, data, tmp_path / out)
+        result = kros("estimate", demo, data, tmp_path / out, "--plot", tmp_path / "x.png")
         assert result.exit_code == 0, result.output
         assert result.output.count("parameters calibrated on the derivative of position") == 3
     names, values = table(tmp_path / "x.csv")
     found = pq.read_table(tmp_path / "x.parquet")
-    assert names == found.column_names == ["unit", "condition", "episode", "k", *columns]
+    states = {"position": "rad", "velocity": "rad/s", "current": "1"}
+    units = {"position": "rad", "target_position": "rad", "target_velocity": "rad/s"}
+    units |= {f"{state}_{ending}": unit for ending in ("hat", "band") for state, unit in states.items()}
+    first = ["unit", "condition", "episode", "k", "time_s", "status"]
+    assert found.column_names == [*first, *units]
+    assert names == [*first, *(f"{name} [{unit}]" for name, unit in units.items())]
     np.testing.assert_array_equal(values, np.column_stack([found[c].to_numpy() for c in columns]))
     facts = json.loads((tmp_path / "x.csv-metadata.json").read_text())
-    assert facts["columns"] == {"position_hat": "rad", "velocity_hat": "rad/s", "current_hat": "1"}
-    assert {c: found.schema.field(c).metadata[b"unit"].decode() for c in columns} == facts["columns"]
+    assert facts["columns"] == units
+    assert {c: found.schema.field(c).metadata[b"unit"].decode() for c in units} == facts["columns"]
+    recorded = np.concatenate([machines.read(key)[:, [0, 3, 4]] for key in machines.episodes])
+    np.testing.assert_allclose(np.column_stack([found[c].to_numpy() for c in SEEN]), recorded, rtol=1e-12)
+    np.testing.assert_allclose(found["time_s"].to_numpy(), 1e-3 * found["k"].to_numpy(), rtol=1e-12)
+    assert set(found["status"].to_pylist()) == {"GOOD"}
+    stated = json.loads((demo / "metrics.json").read_text())
+    bound = stated["observers"][stated["study"]["deployed"]]["set_bound"]
+    assert found["velocity_band"].to_pylist()[0] == pytest.approx(bound["velocity"], rel=1e-9)
+    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads(found.schema.metadata[b"parameters"]) == facts["parameters"]
     assert {p["source"] for p in facts["parameters"].values()} == {"calibrated on the derivative of position"}
     whole = machines.read(machines.episodes[2])[:, :3]  # the first good drive's first episode
@@ -141,7 +157,7 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
     assert result.exit_code == 0, result.output
     assert result.output.count("parameters tracked from the value of the smallest innovation") == 3
     names, values = table(tmp_path / "x.csv")
-    assert names[-1] == "phase"
+    assert names[-1] == "phase [rad]"
     facts = json.loads((tmp_path / "x.csv-metadata.json").read_text())
     assert facts["columns"]["phase"] == "rad"
     for unit, own in facts["parameters"].items():
@@ -162,9 +178,11 @@ def test_missing_samples_are_taken_and_counted(kros, demo, field, tmp_path) -> N
     result = kros("estimate", demo, field(with_holes), tmp_path / "x.parquet")
     assert result.exit_code == 0, result.output
     assert result.output.count("20 samples MISSING; 2 samples INVALID_INPUT") == 3  # of two episodes each
-    assert all(
-        np.isfinite(pq.read_table(tmp_path / "x.parquet")[c].to_numpy()).all() for c in ("velocity_hat", "current_hat")
-    )
+    found = pq.read_table(tmp_path / "x.parquet")
+    assert all(np.isfinite(found[c].to_numpy()).all() for c in ("velocity_hat", "current_hat"))
+    good = np.array(found["status"].to_pylist()) == "GOOD"
+    assert {"MISSING", "INVALID_INPUT"} <= set(found["status"].to_pylist())
+    np.testing.assert_array_equal(np.isfinite(found["velocity_band"].to_numpy()), good)  # what is lost has no bound
 
 
 def test_what_does_not_fit_is_said(kros, lifted, field, tmp_path) -> None:
@@ -186,6 +204,7 @@ def test_what_does_not_fit_is_said(kros, lifted, field, tmp_path) -> None:
     data.write_text(text)
     refused("UNIT.NAME=VALUE", more=("--parameter", "nobody.phase=1"))
     refused("parameters are phase", more=("--track", "lag"))
+    refused("should end in .png", more=("--plot", "x.gif"))
 
 
 def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> None:
@@ -210,3 +229,20 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
     assert all(
         "without velocity, current" in line and "the monitor's bound, from 5 units" in line for line in lines[1::2]
     )
+
+
+@pytest.mark.parametrize(("gain", "code", "word"), [(-1e-4, 0, "SAFE"), (-1e3, 1, "NOT SAFE")])
+def test_a_controller_over_the_demo_is_judged(demo, tmp_path, monkeypatch, capsys, gain, code, word) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "examples" / "closed_loop")
+    main, file = import_module("run").main, tmp_path / "controller.json"
+    content = {"D": [[gain]], "sample_period_s": 0.001, "inputs": ["velocity"], "outputs": ["target_velocity"]}
+    file.write_text(json.dumps(content))
+    command = [str(demo), "--controller", str(file), "--observer", "koopman_edmd/mixed"]
+    assert main([*command, "--json"]) == code
+    said = json.loads(capsys.readouterr().out)
+    assert said["status"] == word
+    assert code or all(radius < 1 for radius in said["spectral_radius"].values())
+    assert code or 1 < said["margin"] <= said["destabilising"]
+    for changed in (content | {"poles": 1}, content | {"inputs": ["speed"]}, content | {"D": [[gain, 0.0]]}):
+        file.write_text(json.dumps(changed))
+        assert main([str(demo), "--controller", str(file)]) == 2

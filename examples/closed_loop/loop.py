@@ -1,0 +1,148 @@
+"""Whether the loop is safe that a controller closes over estimates: for every unit, and for the uncertain set.
+
+Certificates of an observer are about recordings that did not depend on the estimate. In the loop of a controller the
+perturbation of the set is inside: small gain decides on stability, and the worst gain from command to error takes the
+place of the bound that is void. Beside this stands a simulation of every unit with the observer as it is deployed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from controller import Controller
+from linear_loop import LinearLoop
+from simulated_loop import DEFAULT, diverging
+from small_gain import peak, worst_gain
+
+from kros.core.errors import SynthesisError
+from kros.core.norms import hinf_norm
+from kros.data import EpisodeBatch
+from kros.observer import Observer
+from kros.uncertainty.quantify import UncertainModels
+
+ASSUMPTIONS = (
+    "for margin, gain and spectral radius the loop is linear: functions are those of the plant, nothing saturates",
+    "perturbations are linear systems of the set; every measurement arrives, and in time",
+    "commands are independent of one another, which recorded ones may not be",
+)
+
+
+class LoopStatus(StrEnum):
+    """Verdict on a loop.
+
+    SAFE
+        Stability is proven for the whole set, and no unit diverges in simulation.
+    NOT_SAFE
+        The loop of a unit, or of a member of the set, is not stable.
+    UNDECIDED
+        There is no linear analysis, or its bounds are on both sides of the set.
+
+    """
+
+    SAFE = "SAFE"
+    NOT_SAFE = "NOT SAFE"
+    UNDECIDED = "UNDECIDED"
+
+
+@dataclass(frozen=True)
+class LoopResult:
+    """What is known about a loop; None is not known."""
+
+    status: LoopStatus
+    reasons: tuple[str, ...] = ()  # of a verdict that is not SAFE
+    margin: float | None = None  # largest scaling of the set for which stability is proven
+    destabilising: float | None = None  # smallest scaling for which a perturbation was found that destabilises
+    at_hz: float | None = None  # its frequency
+    spectral_radius: Mapping[str, float] = field(default_factory=dict)  # of every unit's loop
+    diverged: tuple[str, ...] = ()  # units whose nonlinear loop diverges in simulation
+    error_gain: float | None = None  # proven largest gain from command to error over the set, signals in ranges
+    nominal_gain: float | None = None  # that of the nominal unit
+    assumptions: tuple[str, ...] = ASSUMPTIONS
+
+    @property
+    def safe(self) -> bool:
+        """Whether stability is proven for the whole set, and no unit diverges."""
+        return self.status is LoopStatus.SAFE
+
+    def lines(self) -> list[str]:
+        """Return what people read."""
+        said = list(self.reasons)
+        if self.margin is not None:
+            said.append(f"stability is proven for {self.margin:.4g} times the uncertain set")
+            said.append(f"{self.destabilising:.4g} times the set destabilises, at {self.at_hz:.3g} Hz")
+        lines = [f"{self.status}: {'; '.join(said)}"]
+        if self.error_gain is not None:
+            both = f"at most {self.error_gain:.4g} over the set, {self.nominal_gain:.4g} for the nominal unit"
+            lines.append(f"gain from command to error, in ranges: {both}")
+        for unit, radius in self.spectral_radius.items():
+            lines.append(f"  unit {unit}: spectral radius {radius:.6g}{', diverges' if unit in self.diverged else ''}")
+        return [*lines, *(f"  assumed: {text}" for text in self.assumptions)]
+
+
+def close_loop(observer: Observer, found: UncertainModels, controller: Any, samples: int = 5000) -> LoopResult:
+    """Judge the loop of a controller that uses an observer's estimates, on all units and on the uncertain set.
+
+    Parameters
+    ----------
+    observer : Observer
+        As it is deployed; its name says which kind of model it belongs to, the first one otherwise.
+    found : UncertainModels
+        Models of all units and the set around them, as `kros.quantify` returns them.
+    controller : Controller or control.StateSpace
+        From estimated states to inputs, by name, in the units of the recordings.
+    samples : int
+        At most, of a simulation.
+
+    Returns
+    -------
+    LoopResult
+
+    Raises
+    ------
+    ConfigError, DimensionError
+        Unknown names of signals, another sampling period, matrices that do not fit, or an observer of other lifted
+        states than the models'.
+
+    """
+    controller = controller if isinstance(controller, Controller) else Controller.from_system(controller)
+    kind = observer.name.partition("/")[0]
+    kind = kind if kind in found.sets else next(iter(found.sets))
+    models, uncertain, facts = found.models.models(kind), found.sets[kind], found.models.facts
+    units = uncertain.unit_ids
+    first = [facts.keys("test", unit, models.condition)[0] for unit in units]
+    batch = EpisodeBatch.read(found.models.population, first, samples)
+    diverged = diverging(observer, models, batch, controller)
+    reasons, known = list[str](), dict[str, Any](diverged=diverged)
+    if diverged:
+        reasons.append(f"it diverges in simulation with {', '.join(diverged)}")
+    try:
+        loop, left_out = LinearLoop.of(observer, models, uncertain, controller.placed(observer, models))
+    except SynthesisError as error:
+        reasons.append(f"there is no linear analysis: {error}")
+        return LoopResult(LoopStatus.NOT_SAFE if diverged else LoopStatus.UNDECIDED, tuple(reasons), **known)
+    if left_out:
+        known["assumptions"] = (*ASSUMPTIONS, f"the linear estimator does without {', '.join(left_out)}")
+    known["spectral_radius"] = {unit: loop.unit(unit).largest_pole() for unit in units}
+    if unstable := [unit for unit, radius in known["spectral_radius"].items() if radius >= 1]:
+        reasons.append(f"it is unstable with {', '.join(unstable)}")
+    known |= bounds(loop, uncertain.nominal_id)
+    if known["destabilising"] <= 1:
+        reasons.append("it is unstable with a member of the set")
+    if reasons:
+        return LoopResult(LoopStatus.NOT_SAFE, tuple(reasons), **known)
+    return LoopResult(LoopStatus.SAFE if known["margin"] >= 1 else LoopStatus.UNDECIDED, **known)
+
+
+def bounds(loop: LinearLoop, nominal: str) -> dict[str, float]:
+    """Return margin, what destabilises, and gains; nothing but zeros where the nominal loop is not stable."""
+    blocks = loop.blocks()
+    if not blocks.system.is_stable():
+        return {"destabilising": 0.0}
+    found = peak(blocks.part(len(blocks.sizes) - 1), DEFAULT.tolerance)
+    known = {"margin": 1 / found.upper, "destabilising": 1 / found.lower, "at_hz": found.at_hz}
+    if known["margin"] > 1:
+        known |= {"error_gain": worst_gain(blocks, DEFAULT.tolerance), "nominal_gain": hinf_norm(loop.unit(nominal))}
+    return known

@@ -1,8 +1,8 @@
 """The command line: a thin face of `kros.study`.
 
 Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not
-met; 4 `kros check` cannot decide on a unit; 128 and the number of a signal that stopped it, 143 for SIGTERM. In the
-library exceptions stay exceptions; `edge` makes one message of each, with the way to the traceback of a defect.
+met; 4 `kros check` cannot decide on a unit; 128 and the number of a signal that stopped it. `edge` makes one message of
+each exception, with the way to the traceback of a defect.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ def edge(ctx: Any = None) -> Iterator[None]:
     except KeyboardInterrupt as stopped:
         number = signal.Signals(stopped.args[0] if stopped.args else signal.SIGINT)
         resumes = ctx is None or ctx.invoked_subcommand in (None, "run", "demo")
-        again = "nothing half done is left; run the same command again."
-        again = "the same command goes on where this one ended." if resumes else again
+        again = "the same command goes on where this one ended." if resumes else "nothing half done is left; run again."
         typer.echo(f"kros: stopped by {number.name if stopped.args else 'Ctrl-C'}; {again}", err=True)
         raise typer.Exit(SIGNALLED + number) from stopped
     except _PASSED:
@@ -127,9 +126,8 @@ def message(error: Exception) -> str:
         reason = str(error) or "no details"
         return f"Memory: there is not enough of it ({reason}); use fewer --workers, shorter episodes or fewer units."
     if isinstance(error, OSError):
-        names = [
-            repr(os.fspath(n)) for n in (error.filename, error.filename2) if isinstance(n, str | bytes | os.PathLike)
-        ]
+        given = error.filename, error.filename2
+        names = [repr(os.fspath(name)) for name in given if isinstance(name, str | bytes | os.PathLike)]
         place = f": {' -> '.join(names)}" if names else ""
         return f"Files: {error.strerror or error}{place}; check the path, its permissions and the space that is left."
     return (
@@ -143,10 +141,8 @@ def _silence_if_broken() -> None:
     try:
         sys.stdout.flush()
     except (OSError, ValueError):
-        with contextlib.suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, sys.stdout.fileno())
-            os.close(nowhere)
+        with contextlib.suppress(OSError, ValueError), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 app = typer.Typer(
@@ -162,16 +158,12 @@ app.add_typer(export, name="export")
 
 
 def _option(text: str, *names: str, metavar: str | None = None, **rest: Any) -> Any:
-    """Return what an option says of itself."""
     return typer.Option(*names, metavar=metavar, help=text, **rest)
 
 
-Text = str | None
 Names = list[str] | None
 Run = Annotated[Path, typer.Argument(metavar="RUN")]
-Data = Annotated[
-    Path, typer.Argument(metavar="DATA", help="Recordings in the format of the study, or a TOML file with [data].")
-]
+Data = Annotated[Path, typer.Argument(metavar="DATA", help="Recordings like the study's, or a TOML file with [data].")]
 Quiet = Annotated[bool, _option("Print JSON and nothing else on standard output.", "--json")]
 Workers = Annotated[int | None, _option("Processes for maps over units; default: one a core.")]
 Overrides = Annotated[Names, _option("Override a key of the study.", "--set", metavar="KEY=VALUE")]
@@ -198,8 +190,8 @@ def _say(lines: Iterable[str]) -> None:
     typer.echo("\n".join(lines))
 
 
-def _json(content: Any) -> None:
-    typer.echo(json.dumps(content, indent=1, ensure_ascii=False))
+def _show(quiet: bool, content: Any, lines: Iterable[str]) -> None:
+    _say([json.dumps(content, indent=1, ensure_ascii=False)] if quiet else lines)
 
 
 def _version(asked: bool) -> None:
@@ -226,7 +218,9 @@ def init(
     measured: Annotated[Names, _option("State that is available at run time; repeatable.", metavar="NAME")] = None,
     input_: Annotated[Names, _option("Input; repeatable.", "--input", metavar="NAME")] = None,
     out: Annotated[Path, _option("New study file.")] = Path("study.toml"),
-    files: Annotated[Text, _option("What a file is, in place of what its name seems to say.", metavar="REGEX")] = None,
+    files: Annotated[
+        str | None, _option("What a file is, in place of what its name seems to say.", metavar="REGEX")
+    ] = None,
     period: Annotated[float | None, _option("Sampling period, where no column holds time.", metavar="SECONDS")] = None,
 ) -> None:
     """Look at a folder of recordings and write a study for it."""
@@ -277,9 +271,7 @@ def simulate(
 def run(
     study: Annotated[Path, typer.Argument(metavar="STUDY.toml")],
     out: Annotated[Path | None, _option("Run folder; default: runs/<study> beside the study file.")] = None,
-    until: Annotated[
-        str, _option("Last stage: read, calibrate, identify, quantify, synthesize, evaluate, left_out or report.")
-    ] = "report",
+    until: Annotated[str, _option("Last stage, such as identify; an unknown one lists all.")] = "report",
     set_: Overrides = None,
     workers: Workers = None,
     scheduler: Annotated[str | None, _option("Address of a Dask scheduler to use instead of processes.")] = None,
@@ -297,10 +289,7 @@ def run(
 def _finish(result: Any, quiet: bool) -> None:
     from .study.commands.summary import summary_lines
 
-    if quiet:
-        _json(result.metrics)
-    else:
-        _say(summary_lines(result))
+    _show(quiet, result.metrics, [] if quiet else summary_lines(result))
 
 
 @app.command()
@@ -309,22 +298,33 @@ def check(
     data: Data,
     workers: Workers = None,
     quiet: Quiet = False,
-    junit: Annotated[Path | None, _option("Write verdicts as JUnit XML.", metavar="FILE")] = None,
+    out: Annotated[list[Path] | None, _option("Write .csv, .html, .json or .xml.", "--out", "--junit")] = None,
     same_unit: Annotated[bool, _option("Compare a unit of the study with the others alone.", "--same-unit")] = False,
 ) -> None:
     """Score new units against a finished study: PASS, FAIL or UNDECIDED; exit code 3 if one fails, 4 undecided."""
-    from .study.commands.check import Verdict, check_units, junit_text, require_folder, verdict_lines, worst
+    from .report.unit_verdicts import Verdict, file_writer, verdict_lines, worst
+    from .study.commands.check import check_units
 
-    if junit is not None:
-        require_folder(junit)
+    write = file_writer(out or ())
     scores = check_units(run_folder, data, _count(workers), same_unit)
-    if quiet:
-        _json(scores)
-    else:
-        _say(verdict_lines(scores))
-    if junit is not None:
-        junit.write_text(junit_text(scores), encoding="utf-8")
+    _show(quiet, scores, verdict_lines(scores))
+    write(scores)
     raise typer.Exit({Verdict.PASS: 0, Verdict.UNDECIDED: UNDECIDED, Verdict.FAIL: NOT_MET}[worst(scores)])
+
+
+@app.command()
+def watch(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where recordings arrive.")],
+    run_folder: Run,
+    out: Annotated[Path | None, _option("Folder of results; default: FOLDER-results.")] = None,
+    every: Annotated[float, _option("Time between two looks; a file that grows is waited for.", metavar="S")] = 2.0,
+    once: Annotated[bool, _option("End when everything that is there has a result.", "--once")] = False,
+) -> None:
+    """Check new recordings as they arrive: a line and a result file each, never lost over restarts."""
+    from .study.commands.watch import watch as results
+
+    for line in results(folder, run_folder, out, every, once):
+        _say([line])
 
 
 @app.command()
@@ -332,15 +332,14 @@ def estimate(
     run_folder: Run,
     data: Data,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New file, .parquet or .csv")],
-    parameter: Annotated[
-        Names, _option("Lifting parameter of a unit, as its phase.", metavar="UNIT.NAME=VALUE")
-    ] = None,
+    parameter: Annotated[Names, _option("Of a unit, as its phase; repeatable.", metavar="UNIT.NAME=VALUE")] = None,
     track: Track = None,
+    plot: Annotated[Path | None, _option("Draw the first episode, .png", metavar="FILE")] = None,
 ) -> None:
     """Write the deployed observer's estimates on recordings; no hidden channels are needed."""
-    from .study.commands.field import estimate_recordings
+    from .study.commands.estimate import estimate_recordings
 
-    _say(estimate_recordings(run_folder, data, out, parameter or (), track))
+    _say(estimate_recordings(run_folder, data, out, parameter or (), track, plot))
 
 
 @export.command("c")
@@ -401,11 +400,7 @@ def compare(
     """Show runs beside each other: settings, recordings, errors, weights, certificates."""
     from .study.commands.summary import compare_runs
 
-    content, lines = compare_runs(run_folders, out)
-    if quiet:
-        _json(content)
-    else:
-        _say(lines)
+    _show(quiet, *compare_runs(run_folders, out))
 
 
 @app.command("list")
@@ -421,7 +416,7 @@ def schema() -> None:
     """Print the JSON schema of study files, for editors; kros init writes it beside the study."""
     from .study.config import study_schema
 
-    _json(study_schema())
+    _show(True, study_schema(), [])
 
 
 @app.command()

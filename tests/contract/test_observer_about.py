@@ -21,8 +21,8 @@ from kros.loops.compiler import find_compiler
 from kros.observer import Observer
 from kros.observer.units import recorded_channel
 from kros.plants import PLANTS
+from kros.study.commands.estimate import estimate_recordings
 from kros.study.commands.export import export_run
-from kros.study.commands.field import estimate_recordings
 
 MAPPING: dict[str, Any] = {
     "files": r"(?P<unit>\w+)_(?P<episode>\d+)[.]csv",
@@ -143,9 +143,12 @@ def test_generated_code_and_estimates_are_in_the_units_of_the_recordings(found, 
         rows = list(csv.DictReader(file))
     unit, episode = rows[0]["unit"], rows[0]["episode"]
     rows = [row for row in rows if (row["unit"], row["episode"]) == (unit, episode)]
-    wanted = np.array([[float(row[f"{s}_hat"]) for s in ("current", "angle")] for row in rows])
     facts = json.loads((tmp_path / "estimates.csv-metadata.json").read_text())
-    assert facts["columns"] == {"current_hat": "0.001 A", "angle_hat": "deg"}
+    units = {name: recorded_channel(study.observer, name).unit for name in ("current", "angle", "voltage")}
+    ended = {f"{name}_{ending}": units[name] for ending in ("hat", "band") for name in ("current", "angle")}
+    assert facts["columns"] == units | ended
+    names = [f"{name}_hat [{units[name]}]" for name in ("current", "angle")]
+    wanted = np.array([[float(row[name]) for name in names] for row in rows])
     columns = np.loadtxt(folder / f"{unit}_{episode}.csv", delimiter=",", skiprows=1)
     angle = columns[:-2, 1] + np.degrees(1e-3 * columns[0, 2]) - columns[0, 1]  # what the README says of the offset
     voltage = columns[2:, 3]  # and of the lag
@@ -157,17 +160,17 @@ def test_generated_code_and_estimates_are_in_the_units_of_the_recordings(found, 
         size = np.abs(wanted).max(axis=0)
         np.testing.assert_allclose(estimates[:-1] / size, wanted[1:] / size, atol=close)
         assert np.abs(wanted[:, 1] - angle).max() < 0.1 * size[1]
-        assert "current [0.001 A], angle [deg], voltage [V]" in (source / "motor.h").read_text()
+        assert "current [mA], angle [deg], voltage [V]" in (source / "motor.h").read_text()
         assert "| angle | deg | added: mean of current - angle" in (source / "README.md").read_text()
         manifest = json.loads((source / "manifest.json").read_text())
-        assert manifest["units_of_measure"] == {"current": "0.001 A", "angle": "deg", "voltage": "V"}
+        assert manifest["units_of_measure"] == {"current": "mA", "angle": "deg", "voltage": "V"}
     with zipfile.ZipFile(export_run(study.folder, tmp_path / "motor.fmu", "motor", fmi=3)[0]) as archive:
         model = ET.fromstring(archive.read("modelDescription.xml"))
     units = {v.get("name"): v.get("unit") for v in model.find("ModelVariables") or ()}
     assert {name: unit for name, unit in units.items() if name != "time"} == {
         "angle": "deg",
         "voltage": "V",
-        "current_hat": "0.001 A",
+        "current_hat": "mA",
         "angle_hat": "deg",
         "status": None,
     }

@@ -35,7 +35,7 @@ def kros() -> Callable[..., Result]:
 def recorded(kros, tmp_path_factory) -> Path:
     """Simulated recordings: five units and an outlier, two conditions, four short episodes."""
     out = tmp_path_factory.mktemp("recorded") / "recordings"
-    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 9, "--outlier")
+    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 12, "--outlier")
     assert result.exit_code == 0, result.output
     return out
 
@@ -44,7 +44,7 @@ def recorded(kros, tmp_path_factory) -> Path:
 def demo(kros, recorded, tmp_path_factory) -> Path:
     """A finished study, with fewer rows and points."""
     folder = tmp_path_factory.mktemp("demo")
-    quick = f"[estimator]\n{QUICK}[uncertainty]\nn_freqs = 120\n"
+    quick = f"[estimator]\n{QUICK}[uncertainty]\nn_freqs = 300\n"
     (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{quick}')
     result = kros("run", folder / "demo.toml", "--out", folder / "run", "--workers", 1)
     assert result.exit_code == 0, result.output

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -115,13 +116,18 @@ def test_the_terminal_says_what_would_have_been_seen(kros, run, tmp_path) -> Non
     lines = good.stdout.splitlines()
     assert [line.split() for line in lines[::2]] == [["PASS", unit] for unit in NEW]
     assert all("would be detected" in line for line in lines[1::2])
-    short = kros(
-        "check", run, recordings(tmp_path / "b", NEW, 2, 100), "--workers", 1, "--junit", tmp_path / "units.xml"
-    )
+    data, files = recordings(tmp_path / "b", NEW, 2, 100), [tmp_path / f"units.{end}" for end in ("xml", "csv", "html")]
+    short = kros("check", run, data, "--workers", 1, *(word for file in files for word in ("--out", file)))
     assert short.exit_code == 4
+    with files[1].open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["verdict"], row["unit"]) for row in rows] == [("UNDECIDED", unit) for unit in NEW]
+    assert all("are needed, found 1.9" in row["reason"] for row in rows)
+    assert files[2].read_text().count(">UNDECIDED</td>") == 5
     assert all("are needed, found 1.9" in line for line in short.stdout.splitlines()[1::2])
     assert (tmp_path / "units.xml").read_text().count('<error type="UNDECIDED"') == 5
-    assert kros("check", run, tmp_path / "b", "--junit", tmp_path / "no" / "units.xml").exit_code == 2
+    assert kros("check", run, tmp_path / "b", "--out", tmp_path / "no" / "units.xml").exit_code == 2
+    assert kros("check", run, tmp_path / "b", "--out", tmp_path / "units.doc").exit_code == 2
 
 
 def test_units_of_the_study_are_not_held_against_themselves(checked, tmp_path) -> None:

@@ -129,7 +129,10 @@ def test_estimates_are_written_one_row_group_an_episode(kros, demo, tmp_path, me
     file = pq.ParquetFile(out)
     assert file.num_row_groups == 6 * 2 * 4
     table = file.read()
-    assert table.column_names == ["unit", "condition", "episode", "k", "position_hat", "velocity_hat", "current_hat"]
+    states = ["position", "velocity", "current"]
+    recorded_too = [*states, "target_position", "target_velocity"]
+    written = [f"{state}_{what}" for what in ("hat", "band") for state in states]
+    assert table.column_names == ["unit", "condition", "episode", "k", "time_s", "status", *recorded_too, *written]
     rows = table.to_pandas()
     one = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == "3")]
     from kros.data import EpisodeKey
@@ -161,7 +164,8 @@ def test_new_units_are_scored(kros, demo, recorded, tmp_path):
     """One of them has the name of a unit of the study. It makes no difference whether the study's own recordings are still there."""
     fresh = tmp_path / "new"
     assert (
-        kros("simulate", fresh, "--units", 2, "--episodes", 3, "--seconds", 8, "--seed", 77, "--outlier").exit_code == 0
+        kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code
+        == 0
     )
     assert "unit 000000" in (refused := kros("check", demo, fresh, "--workers", 1)).stderr
     assert refused.exit_code == 2

@@ -13,14 +13,16 @@ from kros.core.work import Work
 from kros.data import split_episodes, write_parquet
 from kros.data.readers.parquet import read_parquet
 from kros.identify import ModelSet
+from kros.identify.calibration import calibration_keys, segments_of
+from kros.identify.unit_phases import unit_parameters
 from kros.observer import Observer, run_observer
 from kros.study import load_config
 from kros.study import run as run_study
-from kros.study.commands.field import load_calibration, unit_parameters
+from kros.study.commands.field import load_calibration
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.store import Store
-from kros.study.stages.left_out import held_parameters, without
+from kros.study.stages.left_out import without
 
 UNITS = ("001", "002", "003", "004")
 FAST = (
@@ -154,10 +156,12 @@ def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     run_study(config, fold, until=Stage.CALIBRATE)
     run_study(load_config(study(tmp_path, tmp_path / "drives")), whole, until=Stage.CALIBRATE)
     contexts = [Context(config, Store(folder), Work()) for folder in (whole, fold)]
-    phases = held_parameters(contexts[1], contexts[0].population.select(["001003"]), contexts[0].facts)
-    assert phases == unit_parameters(
-        contexts[0].population.select(["001003"]), load_calibration(Store(fold)), contexts[1].facts.identify_on
-    )
+    unit, calibration = contexts[0].population.select(["001003"]), load_calibration(Store(fold))
+    prefer = contexts[1].facts.identify_on
+    phases = unit_parameters(unit, calibration, prefer, contexts[0].facts)
+    assert phases == unit_parameters(unit, calibration, prefer)
+    segments = segments_of((unit, calibration_keys(contexts[0].facts, "001003"), calibration.spec))
+    assert phases == {"001003": {"phase": calibration.calibrate(segments, "001003").phase_rad}}
     assert "001003" not in load_calibration(Store(fold)).units
     made = without(contexts[1], ["001002"])
     assert made.data.exclude == ("001003", "001002")

@@ -10,7 +10,8 @@ from kros.data import Channel, Role, from_arrays
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.observer.monitor import Monitor, octaves
-from kros.study.commands.check import junit_text, monitored, verdict_lines, with_verdict, worst
+from kros.report.unit_verdicts import html_text, junit_text, verdict_lines, with_verdict, worst
+from kros.study.commands.check import monitored
 from kros.study.commands.field import FieldRecordings
 from kros.uncertainty.outliers.score import FEWEST_UNITS as FEWEST
 
@@ -76,6 +77,7 @@ def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_t
         "FAIL",
     ]
     assert (worst(rows[:1]), worst(rows[:3]), worst(rows)) == ("PASS", "UNDECIDED", "FAIL")
+    assert ">&lt;b &#34;" in html_text(rows)
     suite = ElementTree.fromstring(junit_text(rows))
     assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == ("3", "1", "1")
     assert [[child.tag for child in case] for case in suite] == [[], ["error"], ["failure"]]

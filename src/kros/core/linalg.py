@@ -12,7 +12,7 @@ from .arrays import AnyArray, Array, ArrayLike
 
 def adjoint(matrices: AnyArray) -> AnyArray:
     """Return the Hermitian transposes of matrices, shape (..., n, m)."""
-    return np.asarray(np.conj(np.swapaxes(matrices, -1, -2)))
+    return np.conj(np.swapaxes(matrices, -1, -2))
 
 
 def radius_text(value: float) -> str:
@@ -32,7 +32,7 @@ def balanced_size(A: Array) -> Array:
     """Sizes of the states, powers of two, in which rows and columns of A are of alike size, shape (n,)."""
     from scipy.linalg import matrix_balance
 
-    return np.asarray(matrix_balance(A, permute=False, separate=True)[1][0]) if A.size else np.ones(len(A))
+    return matrix_balance(A, permute=False, separate=True)[1][0] if A.size else np.ones(len(A))
 
 
 def entries_first(matrices: AnyArray) -> AnyArray:
@@ -42,7 +42,7 @@ def entries_first(matrices: AnyArray) -> AnyArray:
 
 def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
     """Multiply entries-first matrices: (p, r, ...) times (r, m, ...), broadcast over the rest."""
-    return np.asarray(np.einsum("ik...,kj...->ij...", left, right))
+    return np.einsum("ik...,kj...->ij...", left, right)
 
 
 def squared(values: AnyArray) -> AnyArray:
@@ -66,7 +66,7 @@ def sigma_max_first(matrices: AnyArray) -> AnyArray:
     """Return the largest singular value of entries-first matrices (p, m, ...), shape (...)."""
     columns = matrices if matrices.shape[1] <= matrices.shape[0] else np.swapaxes(matrices, 0, 1)
     if columns.shape[1] > 2:
-        return np.asarray(np.linalg.norm(columns, 2, axis=(0, 1)))
+        return np.linalg.norm(columns, 2, axis=(0, 1))
     first = squared(columns[:, 0]).sum(axis=0)
     if columns.shape[1] == 1:
         return np.sqrt(first)

@@ -48,7 +48,7 @@ def gramian(A: AnyArray, B: AnyArray, dt: float) -> AnyArray:
     from scipy.linalg import solve_continuous_lyapunov
 
     if dt == 0:
-        return np.asarray(solve_continuous_lyapunov(A, -B @ B.T))
+        return solve_continuous_lyapunov(A, -B @ B.T)
     root = gramian_root(A, B)
     return root @ root.T
 

@@ -9,7 +9,7 @@ import logging
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from hashlib import sha256
 from numbers import Real
 from pathlib import Path
@@ -25,7 +25,7 @@ from ..core.rounding import AGREED, ROUNDING
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 
-@dataclass(frozen=True)
+@frozen
 class CheckRule:
     """What recordings are refused for, and which sampling periods are doubted."""
 
@@ -95,7 +95,7 @@ class Recordings:
 
 def usable(values: Array) -> Flags:
     """Tell which samples are numbers of a size that can be computed with."""
-    return np.asarray(np.abs(values) <= limits.MAX_VALUE)
+    return np.abs(values) <= limits.MAX_VALUE
 
 
 def title(key: EpisodeKey) -> str:

@@ -339,7 +339,7 @@ def lowpass(values: Array, cutoff: float) -> Array:
 
     taps = firwin(2 * half + 1, 2 * cutoff, window="hamming")[:, None]
     padded = np.pad(values, ((half, half), (0, 0)), "reflect", reflect_type="odd")
-    return np.asarray(convolve(padded, taps, mode="valid"))
+    return convolve(padded, taps, mode="valid")
 
 
 STEPS: dict[str, type[Step]] = {kind.step: kind for kind in (Scale, Shift, Offset, Trim, Resample, Differentiate)}

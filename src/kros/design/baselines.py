@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,7 +24,7 @@ from ..observer.sensor import delay_of
 from .validation import TrainingSet, rank
 
 
-@dataclass(frozen=True)
+@frozen
 class BaselineSettings:
     """How baselines are tuned and trained."""
 
@@ -128,11 +128,11 @@ def make_trained(training: TrainingSet, measured: tuple[int, ...], kind: Regress
     """Train a regression of scikit-learn on whole training episodes of all units, and without each fold of them."""
     lengths = [len(batch.states) for batch in training.one_by_one()]
     rows = Rows.of(training.one_by_one(), measured, lengths)
-    units = sorted(training.parameters)
+    units, of_all = sorted(training.parameters), rows.fitted(kind)
     folds = [units[k :: DEFAULT.folds] for k in range(min(DEFAULT.folds, len(units)))]
-    by_unit = {unit: one for fold in folds for one in [rows.fitted(kind, fold)] for unit in fold}
+    by_unit = {unit: one for fold in folds for one in [rows.fitted(kind, fold)] for unit in fold} | {"": of_all}
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "units of the fold under test"}
-    return Baseline(by_unit | {"": rows.fitted(kind)}, measured, rows.estimated, facts, seen=training.seen)
+    return Baseline(by_unit, measured, tuple(of_all.regressors), facts, seen=training.seen)
 
 
 @frozen

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, frozen
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
 from ..core.rounding import TINY
@@ -37,7 +37,7 @@ from .validation import TRAINING, hidden_mean, percent_of
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@frozen
 class CertificateSettings:
     """On how much of the recordings certificates and guards rest."""
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import combinations, product
 
 import numpy as np
 
-from ..core.arrays import Array, Flags
+from ..core.arrays import Array, Flags, frozen
 from ..core.rounding import EPS, ITERATED, ROUNDING
 from ..core.work import Work
 from ..observer import Observer
@@ -30,7 +30,7 @@ Group = tuple[str, str]  # unit and condition
 Judged = tuple[Array, Flags]  # innovations, (n_samples, q), and which samples are judged
 
 
-@dataclass(frozen=True)
+@frozen
 class MonitorSettings:
     """How the monitor of the deployed observer is fitted."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from importlib.metadata import version
 from itertools import chain
@@ -40,7 +40,7 @@ from .validation import TrainingSet
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@frozen
 class DeploymentSettings:
     """Which observer is deployed."""
 

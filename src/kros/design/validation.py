@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import chain, zip_longest
 from typing import TypeVar
 
@@ -25,7 +25,7 @@ from ..observer.sensor import Sensors, in_units
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
+@frozen
 class TrainingSettings:
     """How much of the recordings observers are compared on."""
 

@@ -78,9 +78,7 @@ def largest(truth: Array, lengths: Whole) -> Array:
     """Return the largest absolute values of episodes, shape (batch, n)."""
     if np.all(lengths == len(truth)):
         return np.maximum(truth.max(axis=0), -truth.min(axis=0))
-    return np.asarray(
-        np.max(np.abs(truth), axis=0, where=np.arange(len(truth))[:, None, None] < lengths[:, None], initial=0.0)
-    )
+    return np.max(np.abs(truth), axis=0, where=np.arange(len(truth))[:, None, None] < lengths[:, None], initial=0.0)
 
 
 def _percent(rms: Array, largest: Array) -> Array:

@@ -43,14 +43,14 @@ def unit_interval(values: ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[
     >>> bool(lower < 1.5 < upper)
     True
     """
+    from scipy.stats import bootstrap
+
     values = np.asarray(values, dtype=float)
     if values.ndim < 1 or len(values) < 2:
         raise DataError(f"Bootstrap over units: needs at least 2 units, found values of shape {values.shape}.")
-    rows = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
-    places = rows + len(values) * np.arange(draws)[:, None]
-    counts = np.bincount(places.ravel(), minlength=draws * len(values)).reshape(draws, len(values)) / len(values)
-    lower, upper = np.quantile(np.tensordot(counts, values, 1), (0.025, 0.975), axis=0)
-    return np.asarray(lower), np.asarray(upper)
+    rng = np.random.default_rng(seed)
+    result = bootstrap((values,), np.mean, n_resamples=draws, method="percentile", rng=rng)
+    return result.confidence_interval.low, result.confidence_interval.high
 
 
 def interval_rows(rows: Sequence[Row], role: str = "off_nominal") -> list[dict[str, Any]]:

@@ -7,12 +7,12 @@ in whatever units.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from zlib import crc32
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
+from ..core.arrays import Array, ArrayLike, frozen
 from ..data import EpisodeBatch, Population
 from ..data.population import EpisodeKey
 from ..observer import Observer
@@ -57,7 +57,7 @@ def _late(y: Array, behind: Array) -> Array:
     return np.where(share > 0, value + share * (following - value), value)
 
 
-@dataclass(frozen=True)
+@frozen
 class Arriving:
     """Episodes as they arrive: y (n_samples, batch, q), and u (n_samples, batch, m)."""
 

@@ -119,7 +119,7 @@ def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
 def relative_pivots(R: Array) -> Array:
     """Return what is left of every column of a triangle beside those before it, relative to the column."""
     size = np.maximum(np.linalg.norm(R, axis=-2), TINY)
-    return np.asarray(np.abs(np.diagonal(R, axis1=-2, axis2=-1)) / size)
+    return np.abs(np.diagonal(R, axis1=-2, axis2=-1)) / size
 
 
 def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float = 0.0) -> float:

@@ -171,7 +171,7 @@ def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array]
 
 def _peaks(M: Array, peak: Array) -> Array:
     """Bounds of the magnitudes of functions from those of their basis, shape (..., p)."""
-    return np.asarray(np.einsum("...ij,...j->...i", np.abs(M), peak))
+    return np.einsum("...ij,...j->...i", np.abs(M), peak)
 
 
 def require_excitation(
@@ -230,7 +230,7 @@ class Ranges:
 
     def triangles(self, R: Array) -> Array:
         """Return factors of ``[Psi | Theta_plus]`` of channels divided by the ranges."""
-        return np.asarray(R / np.concatenate([self.outputs, self.inputs, self.outputs]))
+        return R / np.concatenate([self.outputs, self.inputs, self.outputs])
 
     def factor(self, factor: Factor) -> Factor:
         """Return the same with what else a factor holds."""

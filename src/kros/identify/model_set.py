@@ -120,7 +120,7 @@ class ModelSet(Storable):
 
     def responses(self, freqs_hz: ArrayLike, units: Sequence[str] | None = None) -> AnyArray:
         """Return frequency responses from inputs to lifted states, shape (unit, frequency, n, m), in recorded units."""
-        return np.asarray(self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale)
+        return self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale
 
     def scaled_responses(self, freqs_hz: ArrayLike, units: Sequence[str] | None = None) -> AnyArray:
         """Return the same with every signal divided by its range."""

@@ -203,7 +203,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _step(self, x: Array, u: Array) -> Array:
         W = np.concatenate([self.A_, self.B_], axis=1)[: len(self.state_names_)]
         with np.errstate(all="ignore"):
-            return np.asarray(np.concatenate([self.lifting_.lift(x), u], axis=1) @ W.T)
+            return np.concatenate([self.lifting_.lift(x), u], axis=1) @ W.T
 
     def _free_run(self, values: Array, edges: Whole) -> Array:
         """Run all episodes as one batch, the shorter ones on with zero inputs and then cut."""

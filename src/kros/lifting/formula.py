@@ -25,6 +25,8 @@ from ..core.errors import ConfigError
 from ..core.files import did_you_mean
 from .program import FUNCTIONS, Program
 
+Names = tuple[str, ...]
+
 _OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -52,8 +54,8 @@ class Formula:
     """One scalar function of named quantities."""
 
     text: str  # as written by the user
-    names: tuple[str, ...]  # quantities that may appear
-    delayed: tuple[str, ...] = ()  # those of which earlier values may appear, such as ``position[-2]``
+    names: Names  # quantities that may appear
+    delayed: Names = ()  # those of which earlier values may appear, such as ``position[-2]``
     sizes: tuple[tuple[str, float], ...] = ()  # sizes of quantities whose values come divided by them
     size: float = 1.0  # what the value of the formula is divided by
 
@@ -104,7 +106,7 @@ def base_and_delay(name: str) -> tuple[str, int]:
 
 
 @lru_cache(maxsize=1 << 12)  # a lifting in other units of measure has the same formulas
-def parse(text: str, names: tuple[str, ...], delayed: tuple[str, ...] = ()) -> Any:
+def parse(text: str, names: Names, delayed: Names = ()) -> Any:
     """Read a formula into a SymPy tree; what may take long is refused before it does."""
     if len(require_text(text)) > MAX_LENGTH:
         raise ConfigError(f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it.")
@@ -140,8 +142,8 @@ def require_text(text: object) -> str:
 @dataclass(frozen=True)
 class _Reader:
     text: str
-    names: tuple[str, ...]
-    delayed: tuple[str, ...]
+    names: Names
+    delayed: Names
 
     def read(self, node: ast.AST) -> Any:
         """Return the tree of a node, its numbers settled."""

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..core.arrays import Array, ArrayLike, Parameters
 from ..core.errors import ConfigError, DimensionError
-from .formula import Formula, base_and_delay, require_text
+from .formula import Formula, Names, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
 from .program import Program
 from .window import FormulaSeparation, Window
@@ -43,11 +43,11 @@ class Lifting:
     [[0.0, 3.0, 0.0]]
     """
 
-    states: tuple[str, ...]
-    functions: tuple[str, ...] = ()  # formulas of states, of earlier values such as ``voltage[-2]``, and of parameters
-    parameters: tuple[str, ...] = ()  # quantities whose value differs from unit to unit, such as ``phase``
-    inputs: tuple[str, ...] = ()  # recorded inputs; needed where formulas name one, otherwise any number passes through
-    input_functions: tuple[str, ...] = ()  # further inputs of the model, such as ``current*voltage``; ``1`` is affine
+    states: Names
+    functions: Names = ()  # formulas of states, of earlier values such as ``voltage[-2]``, and of parameters
+    parameters: Names = ()  # quantities whose value differs from unit to unit, such as ``phase``
+    inputs: Names = ()  # recorded inputs; needed where formulas name one, otherwise any number passes through
+    input_functions: Names = ()  # further inputs of the model, such as ``current*voltage``; ``1`` is affine
     sizes: tuple[tuple[str, float], ...] = ()  # of states, inputs and functions by name, see `in_sizes`; else one
 
     def __post_init__(self) -> None:
@@ -100,7 +100,7 @@ class Lifting:
         """Parsed input functions."""
         return self._parsed(self.input_functions)
 
-    def _parsed(self, texts: tuple[str, ...]) -> tuple[Formula, ...]:
+    def _parsed(self, texts: Names) -> tuple[Formula, ...]:
         names, delayed, known = self.states + self.parameters + self.inputs, self.states + self.inputs, dict(self.sizes)
         sizes = tuple((name, known[name]) for name in delayed if name in known)
         return tuple(Formula(text, names, delayed, sizes, known.get(require_text(text), 1.0)) for text in texts)
@@ -127,7 +127,7 @@ class Lifting:
         return len(self.states) + len(self.functions)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the lifted states."""
         return self.states + self.functions
 
@@ -177,7 +177,7 @@ class Lifting:
         self,
         x: ArrayLike,
         parameters: Parameters | None = None,
-        names: tuple[str, ...] | None = None,
+        names: Names | None = None,
         u: ArrayLike | None = None,
     ) -> Array:
         """Return the derivative of the lifted functions, with inputs that of the input functions, on windows.
@@ -231,12 +231,12 @@ class Lifting:
 
 
 @lru_cache
-def _derivatives(formulas: tuple[Formula, ...], names: tuple[str, ...]) -> Program:
+def _derivatives(formulas: tuple[Formula, ...], names: Names) -> Program:
     """Return the derivatives of formulas by quantities."""
     return Program.of([formula.derivative(name) for formula in formulas for name in names])
 
 
-def _refuse_repeated(formulas: tuple[Formula, ...], originals: tuple[str, ...]) -> None:
+def _refuse_repeated(formulas: tuple[Formula, ...], originals: Names) -> None:
     import sympy as sp
 
     names, known = {sp.Symbol(name, real=True): name for name in originals}, dict[Any, str]()

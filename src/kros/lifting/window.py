@@ -19,7 +19,7 @@ import numpy as np
 
 from ..core.arrays import Array, Index, Parameters
 from ..core.errors import ConfigError, DataError, DimensionError
-from .formula import MAX_TERMS, Formula, base_and_delay, count_terms, delayed_name
+from .formula import MAX_TERMS, Formula, Names, base_and_delay, count_terms, delayed_name
 from .program import Program
 
 
@@ -27,12 +27,12 @@ from .program import Program
 class Window:
     """Layout of a window."""
 
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
+    states: Names
+    inputs: Names
     depths: tuple[tuple[str, int], ...] = ()  # deepest delay of every delayed quantity
 
     @classmethod
-    def of(cls, states: tuple[str, ...], inputs: tuple[str, ...], used: Iterable[str]) -> Window:
+    def of(cls, states: Names, inputs: Names, used: Iterable[str]) -> Window:
         """Collect the delays from the names that formulas use."""
         depths: dict[str, int] = {}
         for base, delay in map(base_and_delay, used):
@@ -50,7 +50,7 @@ class Window:
         return tuple((q, d) for q, depth in self.depths for d in range(1, depth + 1))
 
     @cached_property
-    def earlier(self) -> tuple[str, ...]:
+    def earlier(self) -> Names:
         """Names of the earlier values, in the order of the window."""
         return tuple(delayed_name(q, d) for q, d in self.delayed)
 
@@ -60,7 +60,7 @@ class Window:
         return (*((state, 0) for state in self.states), *self.delayed)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of all entries."""
         return self.states + self.earlier
 
@@ -114,12 +114,12 @@ class FormulaSeparation:
     """Lifted functions written as ``sigma(w; q) = M(q) g(w)``."""
 
     window: Window  # what ``w`` holds
-    parameters: tuple[str, ...]
+    parameters: Names
     basis: tuple[Any, ...]  # SymPy trees of ``g``
     terms: tuple[tuple[tuple[int, Any], ...], ...]  # of each function: columns of ``g`` and coefficients' trees
 
     @classmethod
-    def of(cls, formulas: Sequence[Formula], window: Window, parameters: tuple[str, ...]) -> FormulaSeparation:
+    def of(cls, formulas: Sequence[Formula], window: Window, parameters: Names) -> FormulaSeparation:
         """Separate every formula; one that does not separate raises ConfigError."""
         import sympy as sp
 

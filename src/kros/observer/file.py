@@ -29,6 +29,8 @@ from .monitor import Monitor
 from .runtime import Guard, Runtime, Seen
 from .sensor import Sensor
 
+Content = dict[str, Any]  # of JSON
+
 log = logging.getLogger(__name__)
 SCHEMA, KIND = 3, "observer"
 _PERHAPS = ("lifting_inputs", "input_functions", "sizes", "sensor", "about")  # absent where they are empty
@@ -61,15 +63,15 @@ class _Controller(_Model):
 
 def _part(kind: Any) -> Any:
     """Return what the file holds of a part whose fields are numbers, arrays of them, or numbers by name."""
-    types: dict[str, Any] = {"Array": Row | Matrix, "Array | None": Limits, "float": float, "int": int}
-    held: dict[str, Any] = {}
+    types: Content = {"Array": Row | Matrix, "Array | None": Limits, "float": float, "int": int}
+    held: Content = {}
     for f in fields(kind):
         needed = f.default is MISSING and f.default_factory is MISSING
         held[f.name] = (types[str(f.type)], ...) if needed else (types[str(f.type)] | None, None)
     return create_model(f"_{kind.__name__}", __base__=_Part, **held)
 
 
-_PARTS: dict[str, Any] = {
+_PARTS: Content = {
     "runtime": Runtime,
     "seen": Seen,
     "filter_bank": FilterBank,
@@ -97,15 +99,15 @@ class _File(_Part):
     sample_period_s: float = Field(gt=0)
     model: _Model
     controller: _Controller
-    sensor: dict[str, Any] = Field(default_factory=dict)
-    about: dict[str, Any] = Field(default_factory=dict)
+    sensor: Content = Field(default_factory=dict)
+    about: Content = Field(default_factory=dict)
 
 
-_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
+_KINDS: Content = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
 _Whole = create_model("_Whole", __base__=_File, **_KINDS)
 
 
-def observer_content(observer: ObserverData) -> dict[str, Any]:
+def observer_content(observer: ObserverData) -> Content:
     """Return what the file of an observer holds, without its checksum."""
     lifting = observer.lifting
     parts = {key: getattr(observer, _field(key)) for key in _PARTS}
@@ -129,7 +131,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "sensor": {name: sensor.model_dump() for name, sensor in observer.sensor.items()},
         "about": observer.about,
     }
-    written: dict[str, Any] = plain(content)
+    written: Content = plain(content)
     return {key: value for key, value in written.items() if value or key not in _PERHAPS}
 
 
@@ -202,7 +204,7 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
     )
 
 
-def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
+def _given(fields: Mapping[str, Any]) -> Content:
     """Return the fields that are not null."""
     return {name: value for name, value in fields.items() if value is not None}
 

@@ -78,20 +78,9 @@ def text(value: Any) -> str:
 
 def data(facts: Facts) -> Rows:
     """Return what was recorded."""
-    study = facts.study
-    episodes = {f"episodes, {c}": sum(counts.values()) for c, counts in study.get("episodes", {}).items()}
-    recorded = {f"resolution of {channel}": size for channel, size in study.get("resolution", {}).items()}
-    return {
-        "units": study["units"],
-        "units set aside": sum(row.get("group") == "outliers" for row in facts.get("units", ())),
-        "conditions": text(study["conditions"]),
-        "models from condition": study["identify_on"],
-        **episodes,
-        "sampling period (s)": study["sample_period_s"],
-        "channels": text(list(study["channels"])),
-        "measured": text(study["measured"]),
-        **recorded,
-    }
+    aside = sum(row.get("group") == "outliers" for row in facts.get("units", ()))
+    study = {name: value for name, value in facts.study.items() if name not in ("deployed", "alerts")}
+    return dict(flat(study | {"units_set_aside": aside}))
 
 
 def deployed(facts: Facts) -> Rows:

@@ -23,6 +23,8 @@ from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
 from .manifest import MANIFEST, recorded_files
 
+Record = dict[str, Any]  # content of an artifact
+
 T = TypeVar("T")
 
 
@@ -60,13 +62,13 @@ class RunFolder:
         return name in self.files
 
     @cached_property
-    def study(self) -> dict[str, Any]:
+    def study(self) -> Record:
         """The study with all settings."""
-        content: dict[str, Any] = read_json(self.folder / "study.json")
+        content: Record = read_json(self.folder / "study.json")
         return content
 
     @cached_property
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Record:
         """Groups of units, episodes for training and testing, condition of the models."""
         self._require("population/facts.json", "the recordings have not been read yet")
         return self._record("population/facts.json")
@@ -153,12 +155,12 @@ class RunFolder:
         return self._record("observers/observers.json").get("deployed")
 
     @cached_property
-    def evaluation(self) -> dict[str, Any]:
+    def evaluation(self) -> Record:
         """Errors of all observers and models."""
         return self._evaluation[0]
 
     @cached_property
-    def _evaluation(self) -> tuple[dict[str, Any], dict[str, AnyArray]]:
+    def _evaluation(self) -> tuple[Record, dict[str, AnyArray]]:
         reason = "the observers have not been evaluated yet"
         return load_artifact(self._require("evaluation/evaluation.json", reason), "evaluation")
 
@@ -178,7 +180,7 @@ class RunFolder:
         time_s = np.arange(len(part["states"])) * self.sample_period_s
         return Shown(key, time_s, part["states"], part["inputs"], observers, models)
 
-    def _record(self, name: str) -> dict[str, Any]:
+    def _record(self, name: str) -> Record:
         """Return the content of an artifact; nothing where the run does not have it."""
         path = self.folder / name
         return load_artifact(path.parent, path.stem)[0] if self.has(name) else {}

@@ -20,6 +20,8 @@ from ..observer import EstimatorSettings
 from ..observer.sensor import Sensor
 from ..uncertainty.settings import UncertaintySettings
 
+Tables = dict[str, Any]  # of TOML
+
 
 class Stage(StrEnum):
     """Stages in the order in which data flow.
@@ -53,8 +55,8 @@ class DataConfig(Settings):
     on_nan: Literal["error", "drop_episode"] = Field(
         "error", description="what an episode with a missing value is: an error, or left out"
     )
-    prepare: tuple[dict[str, Any], ...] = Field((), description="preparation steps, in order")
-    csv: dict[str, Any] | None = Field(None, description="the mapping, for the reader csv")
+    prepare: tuple[Tables, ...] = Field((), description="preparation steps, in order")
+    csv: Tables | None = Field(None, description="the mapping, for the reader csv")
 
     @field_validator("source")
     @classmethod
@@ -129,7 +131,7 @@ class StudyConfig(Settings):
     evaluate: EvaluateConfig = EvaluateConfig()
     load: LoadConfig = LoadConfig()
 
-    def dump(self) -> dict[str, Any]:
+    def dump(self) -> Tables:
         """Return the resolved study in JSON's types."""
         return self.model_dump(mode="json")
 
@@ -159,9 +161,7 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     return validate_config(raw, path.parent, str(path), overrides)
 
 
-def validate_config(
-    raw: dict[str, Any], base: Path, origin: str = "study", overrides: Sequence[str] = ()
-) -> StudyConfig:
+def validate_config(raw: Tables, base: Path, origin: str = "study", overrides: Sequence[str] = ()) -> StudyConfig:
     """Validate a study given as tables; a relative source is relative to `base`, overrides are as in `load_config`.
 
     Examples
@@ -180,7 +180,7 @@ def validate_config(
     return config.model_copy(update={"data": config.data.model_copy(update={"source": source})})
 
 
-def study_schema() -> dict[str, Any]:
+def study_schema() -> Tables:
     """Return the JSON schema of a study file, with the mapping of recordings and the preparation steps."""
     schema, mapping = StudyConfig.model_json_schema(), mapping_schema()
     schema["$defs"] |= {**mapping.pop("$defs"), "CsvMapping": mapping}
@@ -197,7 +197,7 @@ def stored_config(raw: Any, path: Path) -> StudyConfig:
         raise ConfigError(f"{error} It is damaged, or of another version of kros; run the study again.") from error
 
 
-def _apply(raw: dict[str, Any], override: str) -> None:
+def _apply(raw: Tables, override: str) -> None:
     key, separator, text = override.partition("=")
     if not separator or not key.strip():
         raise ConfigError(f"--set {override!r}: should look like KEY=VALUE, for example identify.alpha=90.")

@@ -19,25 +19,27 @@ from .engine.store import Store
 from .stages import left_out
 from .stages.load import load_metrics
 
+Part = dict[str, Any]  # of metrics.json
 
-def collect_metrics(context: Context, until: Stage) -> dict[str, Any]:
+
+def collect_metrics(context: Context, until: Stage) -> Part:
     """Collect the metrics of all stages up to one."""
     done = list(Stage)[: list(Stage).index(until) + 1]
-    metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done)}
+    metrics: Part = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done)}
     metrics["units"] = _units(context, done)
     for stage in done:
         if stage is Stage.EVALUATE:
             metrics |= _evaluation(context, metrics)
         elif stage in _OF_STAGES:
             metrics |= _OF_STAGES[stage](context)
-    clean: dict[str, Any] = plain(metrics)
+    clean: Part = plain(metrics)
     return clean
 
 
-def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
+def _study(context: Context, done: list[Stage]) -> Part:
     facts, population, sensor = context.facts, context.population, context.config.sensor
     parts = {"train": facts.train, "held_out": facts.test}
-    study: dict[str, Any] = {
+    study: Part = {
         "units": len(facts.pooled),
         "conditions": population.conditions,
         "identify_on": facts.identify_on,
@@ -68,13 +70,13 @@ def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
     return timing | {"total": sum(timing.values())}
 
 
-def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
-    facts, rows = context.facts, list[dict[str, Any]]()
+def _units(context: Context, done: list[Stage]) -> list[Part]:
+    facts, rows = context.facts, list[Part]()
     calibration = context.calibration if Stage.CALIBRATE in done else None
     models = context.identified.models() if Stage.IDENTIFY in done else None
     for unit, group in facts.groups.items():
         keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
-        row: dict[str, Any] = {"unit": unit, "group": group}
+        row: Part = {"unit": unit, "group": group}
         row |= {"conditions": list(dict.fromkeys(k.condition for k in keys)), "status": "ok"}
         if calibration is not None:
             phase = calibration.units.get(unit)
@@ -88,7 +90,7 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
     return rows
 
 
-def _calibration(context: Context) -> dict[str, Any]:
+def _calibration(context: Context) -> Part:
     """What the phase of every unit belongs to; empty for a study without one."""
     calibration = context.calibration
     if calibration is None:
@@ -98,7 +100,7 @@ def _calibration(context: Context) -> dict[str, Any]:
     return {"calibration": {name: getattr(spec, name) for name in names} | {"lag_rad": calibration.lag_rad}}
 
 
-def _models(context: Context) -> dict[str, Any]:
+def _models(context: Context) -> Part:
     """Models: order, functions and largest spectral radius over the pooled units."""
     entries = {}
     for name in context.identified.kinds:
@@ -110,17 +112,17 @@ def _models(context: Context) -> dict[str, Any]:
     return {"models": entries}
 
 
-def _uncertainty(context: Context) -> dict[str, Any]:
+def _uncertainty(context: Context) -> Part:
     """Uncertain models by kind, and the scores of all units."""
     uncertain = context.uncertain
     entries = {name: _uncertain_model(context.store, name, one) for name, one in uncertain.sets.items()}
     return {"uncertainty": entries, "outliers": uncertain.scores}
 
 
-def _uncertain_model(store: Store, name: str, model: UncertainModel) -> dict[str, Any]:
+def _uncertain_model(store: Store, name: str, model: UncertainModel) -> Part:
     """Return the metrics of one uncertain model, and the share of noise in it."""
     weight = model.weight
-    entry: dict[str, Any] = {name: getattr(model, name) for name in ("form", "peak_db", "misfit_max")}
+    entry: Part = {name: getattr(model, name) for name in ("form", "peak_db", "misfit_max")}
     entry["nominal"] = model.nominal_id
     entry["weight"] = {name: getattr(model, name) for name in ("cover_max", "overbound_db_max")}
     entry["weight"]["orders"] = [weight.left_orders, weight.right_orders]
@@ -130,7 +132,7 @@ def _uncertain_model(store: Store, name: str, model: UncertainModel) -> dict[str
     return entry
 
 
-def _observers(context: Context) -> dict[str, Any]:
+def _observers(context: Context) -> Part:
     """Observers with what their synthesis and certificates state, and what the deployed one reads."""
     record = context.observers_record
     entries = {name: dict(facts) for name, facts in record["facts"].items()}
@@ -143,7 +145,7 @@ def _observers(context: Context) -> dict[str, Any]:
     return {"observers": entries, "deployment": _deployment(context)}
 
 
-def _deployment(context: Context) -> dict[str, Any]:
+def _deployment(context: Context) -> Part:
     """Return what the deployed observer reads, estimates and needs of its sensors."""
     observer = Observer.load(context.store.path("observers", "deployed.json"))
     measured, sizes = observer.outputs, observer.about["largest_in_training"]
@@ -161,7 +163,7 @@ def _deployment(context: Context) -> dict[str, Any]:
     }
 
 
-def _evaluation(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
+def _evaluation(context: Context, metrics: Part) -> Part:
     """Errors on held-out episodes, of the load, and of recorded states where truth is recorded."""
     evaluated = context.evaluation
     for name, errors in evaluated["free_run"].items():

@@ -93,7 +93,7 @@ def _between(freqs: AnyArray, values: AnyArray, at_hz: AnyArray) -> AnyArray:
     """Return responses (unit, frequency, p, m) at other frequencies, on straight lines, constant beyond the ends."""
     from scipy.interpolate import make_interp_spline
 
-    return np.asarray(make_interp_spline(freqs, values, k=1, axis=1)(np.clip(at_hz, freqs[0], freqs[-1])))
+    return make_interp_spline(freqs, values, k=1, axis=1)(np.clip(at_hz, freqs[0], freqs[-1]))
 
 
 def _bound(

@@ -79,4 +79,4 @@ def noise_share(
 
 def _mean_square(E: AnyArray) -> AnyArray:
     """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
-    return np.asarray(squared(E).sum(axis=(-2, -1)).mean(axis=0))
+    return squared(E).sum(axis=(-2, -1)).mean(axis=0)

@@ -12,7 +12,6 @@ weights and designs the paper's own observer with them; its sets have diagonal w
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -84,9 +83,10 @@ def fit_entries(
 ) -> EntryWeights:
     """Return one magnitude for every entry of residuals (unit, frequency, p', m')."""
     p, m = E.shape[2:]
-    options: dict[str, Any] = {"max_order": max_order, "tolerance_db": tolerance_db}
     sizes = np.abs(E).max(axis=0).reshape(len(freqs_hz), p * m).T
-    fits = [fit_magnitude(freqs_hz, size, sample_period_s, **options) for size in sizes]
+    fits = [
+        fit_magnitude(freqs_hz, size, sample_period_s, max_order=max_order, tolerance_db=tolerance_db) for size in sizes
+    ]
     rows, columns = np.kron(np.eye(p), np.ones((1, m))), np.tile(np.eye(m), (p, 1))
     entries = block_diagonal([fit.system for fit in fits])
     system = gain(rows, sample_period_s) @ entries @ gain(columns, sample_period_s)

@@ -23,6 +23,8 @@ from ..text import plain, plain_names, require_identifier
 from .origin import OriginShift, find_shift
 from .realise import RULE, realised
 
+Named = dict[str, Any]  # what templates name
+
 TOLERANCE = {"double": 1e-9, "float": 1e-3}  # of golden vectors
 DOUBLE, SINGLE = Precision(), Precision("float")
 
@@ -78,7 +80,7 @@ class Source:
         shift = find_shift(observer) if precision == "float" else None
         return cls(observer, name, Precision(precision), shift, loop, load)
 
-    def context(self) -> dict[str, Any]:
+    def context(self) -> Named:
         """Return everything that the templates name."""
         lifting = self.observer.lifting
         parts = {"monitor": self.monitor(), "guard": self.guard(), "bank": self.bank(), "tracked": self.tracked()}
@@ -91,7 +93,7 @@ class Source:
             "sample_period_s": DOUBLE.literal(self.observer.sample_period_s),
         }
 
-    def layout(self) -> dict[str, Any]:
+    def layout(self) -> Named:
         """Return names, units of measure, and numbers of states, channels and samples."""
         o, factors, measured, lifting = self.observer, self.factors(), self.observer.outputs, self.observer.lifting
         return {
@@ -125,7 +127,7 @@ class Source:
             "window_present": lifting.window.present.tolist(),
         }
 
-    def linear(self) -> dict[str, Any]:
+    def linear(self) -> Named:
         """Return the model and the correction, zeros left out."""
         o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
         parts = np.hstack([o.A, o.B])[:n], o.into[:n] @ np.hstack([K.C, K.D]), np.hstack([K.A, K.B])
@@ -135,7 +137,7 @@ class Source:
             "filter_gain": self.sums(o.filter_gain),
         }
 
-    def limits(self) -> dict[str, Any]:
+    def limits(self) -> Named:
         """Return limits and default parameters."""
         o, q, bounds, sides = self.observer, len(self.observer.measured), self.bounds(), self.observer.runtime.sides
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, o.outputs))
@@ -148,7 +150,7 @@ class Source:
             "default_parameters": self.row(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
         }
 
-    def origin(self) -> dict[str, Any]:
+    def origin(self) -> Named:
         """Return how the origin moves; nothing where it cannot."""
         shift, o = self.shift, self.observer
         if shift is None:
@@ -193,7 +195,7 @@ class Source:
         """Return the literals of factors in double precision; none where all are one."""
         return [] if all(factor == 1 for factor in factors) else row(np.array(factors))
 
-    def tracked(self) -> dict[str, Any] | None:
+    def tracked(self) -> Named | None:
         """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""
         if self.loop is None:
             return None
@@ -218,7 +220,7 @@ class Source:
             "most": write(MOST),
         }
 
-    def load_torque(self) -> dict[str, Any] | None:
+    def load_torque(self) -> Named | None:
         """Return the numbers of `AngleLoad`, in double precision: it sums up without end."""
         if self.load is None:
             return None
@@ -241,7 +243,7 @@ class Source:
         """Return the literal of a channel's factor; None where it is one."""
         return next(iter(self.literals(recorded_factors(self.observer, [name]).tolist())), None)
 
-    def bank(self) -> dict[str, Any] | None:
+    def bank(self) -> Named | None:
         """Return what a filter bank starts with and does in gaps; None where the observer is none."""
         own, o, first = self.observer.bank, self.observer, len(self.observer.recorded)
         if own is None:
@@ -259,7 +261,7 @@ class Source:
             "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
         }
 
-    def monitor(self) -> dict[str, Any] | None:
+    def monitor(self) -> Named | None:
         """Return what the monitor computes with; None where the observer has none."""
         own = self.observer.monitor
         if own is None:
@@ -278,7 +280,7 @@ class Source:
             "units": own.units,
         }
 
-    def guard(self) -> dict[str, Any]:
+    def guard(self) -> Named:
         """Return the bounds of states and of the correction, and how long a start takes."""
         own, n, most = self.observer.guard, self.observer.lifting.n_states, self.precision.largest
         low, high = np.clip(bounds(own, n, self.observer.controller.n_states), -most, most)

@@ -5,17 +5,17 @@ Internal states are in a real block diagonal form: two multiplications each in p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.rounding import ROUNDING
 from ...observer import Observer
 from ...observer.units import in_coordinates
 
 
-@dataclass(frozen=True)
+@frozen
 class ExportRule:
     """How an observer is realised in C, and how the origin of single precision moves; estimates stay the same."""
 

@@ -23,7 +23,7 @@ from .minimax import smallest_largest
 
 def unit_circle(points: int, decades: int = 6) -> AnyArray:
     """Return ``exp(j omega)`` at logarithmic frequencies, some decades below Nyquist up to it."""
-    return np.asarray(np.exp(1j * np.pi * np.logspace(-decades, 0, points)))
+    return np.exp(1j * np.pi * np.logspace(-decades, 0, points))
 
 
 @frozen
@@ -54,7 +54,7 @@ class ResponsePrior:
         left = np.linalg.pinv(G)
         E = left @ (G - G0)
         Z = np.concatenate([G, np.broadcast_to(np.eye(m), (*G.shape[:2], m, m))], axis=-2)
-        return np.asarray(E), np.asarray(left @ Phi), np.asarray(self.T.T @ Z @ (np.eye(m) - E))
+        return np.asarray(E), left @ Phi, self.T.T @ Z @ (np.eye(m) - E)
 
     def normal(self, V: Array) -> Array:
         """Return ``[J r]^T [J r]`` with r = -E, weighted for the gradient of the cost; shape (unit, P + 1, P + 1)."""

@@ -204,7 +204,7 @@ def refine_pooled(V: Array, problem: RefinementProblem) -> Array:
             "unstable; omit lifting functions that grow, or set identify.refine = false."
         )
     edged = replace(problem, sigma=normalised(few, inside).sigma, edged=True)
-    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, inside).V[0])
+    return options.search.minimise(edged.evaluate, edged.admissible, inside).V[0]
 
 
 def _stable_end(V: Array, problem: RefinementProblem) -> Array | None:
@@ -238,7 +238,7 @@ def _whitening(R11: Array, n_samples: int) -> Array:
     size = np.maximum(np.linalg.norm(R11, axis=0), TINY)
     _, values, right = np.linalg.svd(R11 / size)
     values = np.maximum(values, len(values) * EPS * values[0])
-    return np.asarray((right.T / values) * np.sqrt(n_samples) / size[:, None])
+    return (right.T / values) * np.sqrt(n_samples) / size[:, None]
 
 
 _TOGETHER = 32  # episodes, as many as the compiled loop runs side by side

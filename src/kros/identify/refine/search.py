@@ -21,7 +21,7 @@ class Solution:
     cost: Array  # sum of squared residuals, (problem,)
 
 
-@dataclass(frozen=True)
+@frozen
 class GaussNewton:
     """Minimise sums of squares of r(V) by steps ``(H + mu I) d = J^T r``, ``H = J^T J`` scaled to a unit diagonal.
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters
+from ...core.arrays import Array, Parameters, frozen
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 
 
-@dataclass(frozen=True)
+@frozen
 class FilteredDifference:
     """Rates of measured states by filtered differences; all other states are not estimated."""
 

@@ -12,7 +12,6 @@ equal.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 
 
-@dataclass(frozen=True)
+@frozen
 class Ridge:
     """Settings of the regression."""
 

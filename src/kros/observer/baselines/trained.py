@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from ...core.arrays import Array, Parameters, frozen
-from ...core.errors import DataError
+from ...core.arrays import AnyArray, Array, Parameters, frozen
+from ...core.errors import DataError, MissingDependencyError
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 
 Regressor = Literal["boosting", "network"]
 
 
-@dataclass(frozen=True)
+@frozen
 class Features:
     """What a regression sees at a sample: the sample before, the start, the time since, and what came between."""
 
@@ -44,17 +42,15 @@ class Trained:
     """A regression of scikit-learn for every hidden state."""
 
     n_states: int
-    estimated: tuple[int, ...]
     features: Features
-    regressors: Sequence[Any]
+    regressors: Mapping[int, Any]  # by state
 
     def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n)."""
-        del parameters
         estimate = np.full((*y.shape[:-1], self.n_states), np.nan)
         for i in range(y.shape[1]):
             X = self.features.of(y[:, i], u[:, i])
-            for state, regressor in zip(self.estimated, self.regressors, strict=True):
+            for state, regressor in self.regressors.items():
                 estimate[:, i, state] = regressor.predict(X)
         return estimate
 
@@ -63,12 +59,11 @@ class Trained:
 class Rows:
     """Thinned rows of training episodes, with the unit of each."""
 
-    n_states: int
-    estimated: tuple[int, ...]
+    measured: Sequence[int]
     features: Features
     X: Array  # (rows, .)
-    targets: Array  # (rows, h)
-    units: npt.NDArray[np.str_]  # (rows,)
+    states: Array  # (rows, n)
+    units: AnyArray  # (rows,)
 
     @classmethod
     def of(
@@ -82,35 +77,27 @@ class Rows:
             X.append(features.of(batch.measurements(measured)[:, 0], batch.inputs[:, 0])[some])
             states.append(batch.states[some, 0])
             units += [batch.units[0]] * len(X[-1])
-        n = states[0].shape[1]
-        estimated = tuple(i for i in range(n) if i not in measured)
-        if not estimated:
-            raise DataError("Regression: every state is measured, there is nothing to estimate.")
-        return cls(n, estimated, features, np.vstack(X), np.vstack(states)[:, estimated], np.array(units))
+        return cls(measured, features, np.vstack(X), np.vstack(states), np.array(units))
 
     def fitted(self, kind: Regressor, without: Sequence[str] = ()) -> Trained:
         """Train on all units but some."""
-        from sklearn.base import clone
-
-        rows, regressor = ~np.isin(self.units, without), regressor_of(kind)
+        rows, (_, n) = ~np.isin(self.units, without), self.states.shape
         if not rows.any():
             raise DataError(f"Regression: no unit is left without {', '.join(without)}; record more units.")
-        each = [clone(regressor).fit(self.X[rows], target[rows]) for target in self.targets.T]
-        return Trained(self.n_states, self.estimated, self.features, each)
+        X, Y = self.X[rows], self.states[rows]
+        hidden = {i: regressor_of(kind).fit(X, Y[:, i]) for i in range(n) if i not in self.measured}
+        return Trained(n, self.features, hidden)
 
 
 def regressor_of(kind: Regressor) -> Any:
     """Return the regression of a kind, with scaling where it needs one."""
     try:
-        from sklearn.compose import TransformedTargetRegressor
-        from sklearn.ensemble import HistGradientBoostingRegressor
-        from sklearn.neural_network import MLPRegressor
-        from sklearn.pipeline import make_pipeline
-        from sklearn.preprocessing import StandardScaler
+        from sklearn import compose, ensemble, neural_network, pipeline, preprocessing
     except ImportError as error:
         problem = f"the baseline {kind} needs scikit-learn, which is not installed"
-        raise DataError(f"Regression: {problem}; pip install 'kros[sklearn]'.") from error
+        raise MissingDependencyError(f"Regression: {problem}; pip install 'kros[sklearn]'.") from error
     if kind == "boosting":
-        return HistGradientBoostingRegressor(max_iter=500, early_stopping=True, random_state=0)
-    network = MLPRegressor(hidden_layer_sizes=(64, 64), early_stopping=True, max_iter=300, random_state=0)
-    return TransformedTargetRegressor(make_pipeline(StandardScaler(), network), transformer=StandardScaler())
+        return ensemble.HistGradientBoostingRegressor(max_iter=500, early_stopping=True, random_state=0)
+    layers = neural_network.MLPRegressor(hidden_layer_sizes=(64, 64), early_stopping=True, max_iter=300, random_state=0)
+    scaled = pipeline.make_pipeline(preprocessing.StandardScaler(), layers)
+    return compose.TransformedTargetRegressor(scaled, transformer=preprocessing.StandardScaler())

@@ -24,7 +24,6 @@ E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian e
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -36,7 +35,7 @@ from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 from .error import ErrorSystem
 
 
-@dataclass(frozen=True)
+@frozen
 class ProofSettings:
     """How a proof is looked for; a gain that is proven is one whatever these are."""
 

@@ -114,8 +114,8 @@ def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCe
         {},
         {},
         status=ReliftStatus.CERTIFIED,
-        gain=float(gain),
-        lower_bound=float(gain),
+        gain=gain,
+        lower_bound=gain,
     )
 
 

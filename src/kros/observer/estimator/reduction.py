@@ -8,6 +8,7 @@ Control 26 (1981) 17-32; L. Pernebo and L. M. Silverman, ibid. 27 (1982) 382-387
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import replace
 
 import numpy as np
@@ -80,9 +81,10 @@ def reduced(readout: Readout, order: int | None = None) -> Filters:
         return whole.first(order)
     signals = design.signals(some=_EPISODES, length=round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
     wanted, most = whole.along(signals), 2 * design.settings.loss
-    low, high = 0, len(sigma)
-    while high - low > 1:  # of errors that grow as little as asked, the least order
-        middle = (low + high) // 2
-        missed = (whole.first(middle).along(signals) - wanted)[..., used] / errors[used]
-        low, high = (low, middle) if np.mean(missed**2, axis=(0, 1)).max() <= most else (middle, high)
-    return whole.first(high)
+
+    def enough(order: int) -> bool:
+        missed = (whole.first(order).along(signals) - wanted)[..., used] / errors[used]
+        return bool(np.mean(missed**2, axis=(0, 1)).max() <= most)
+
+    # of errors that grow as little as asked, the least order
+    return whole.first(1 + bisect_left(range(1, len(sigma)), True, key=enough))

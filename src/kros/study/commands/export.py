@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ...core.artifacts import load_artifact, write_json
+from ...core.artifacts import write_json
 from ...core.errors import ConfigError, KrosError
-from ...core.files import did_you_mean
 from ...data import EpisodeBatch
 from ...data.discovery.roles import identifier
 from ...evaluate.sensor import as_arriving
@@ -23,20 +21,19 @@ from ..config import Stage, StudyConfig
 from ..engine.store import Store, open_finished
 from ..stages.learning import open_source
 from ..stages.load import TRIAL, angle_load
-from .field import load_calibration
+from .field import load_calibration, load_observer
 
 LARGEST = 20_000  # samples of the recording that generated code is compared on
 TOO_COARSE = 1.0  # percent of the largest estimate: generated code that differs by more is warned of
 
 log = logging.getLogger(__name__)
-DEPLOYED, LOAD = "deployed", "load"
 
 
 def export_run(
     run: Path,
     out: Path,
     name: str | None,
-    observer: str = DEPLOYED,
+    observer: str = "deployed",
     *,
     fmi: int | None = None,
     precision: str = "double",
@@ -47,24 +44,11 @@ def export_run(
     `name` is the study's by default.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
-        names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
-        places = {name: store.path("observers", f"{name}.json") for name in names}
-        loads = {
-            f"{k}/{LOAD}": store.path(LOAD, f"{k}.json")
-            for k in ("koopman", "linear")
-            if store.holds(LOAD, f"{k}.json")
-        }
-        if observer not in (known := places | loads):
-            hint = f"{did_you_mean(observer, known) or ';'} known are {', '.join(known)}"
-            raise ConfigError(f"Run {run}: has no observer {observer!r}{hint}.")
-        chosen, name = Observer.load(known[observer]), name or identifier(config.name)
-        if not chosen.about:  # that of a load: its channels are those of the observer that is deployed
-            about = Observer.load(places[DEPLOYED]).about
-            chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
+        chosen, name = load_observer(store, observer), name or identifier(config.name)
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track), ""
         level = angle_load(config.estimator, chosen.sample_period_s)
-        load = LoadOutput(level, current=TRIAL.current) if observer in loads else None
+        load = LoadOutput(level, current=TRIAL.current) if observer.endswith("/load") else None
         folder = export_c(chosen, out, name, precision, track, load)
         write_json(folder / "study.json", config.dump())
         return folder, "" if track else exactness(folder, chosen, config, store)

@@ -1,47 +1,41 @@
-"""Recordings beside a finished run, with parameters of every unit, and `kros estimate`, in the recordings' units."""
+"""Recordings beside a finished run: their channels, parameters of every unit, and the deployed observer on them."""
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...core.arrays import Array, Bits
-from ...core.artifacts import write_json
+from ...core.artifacts import load_artifact
 from ...core.errors import ConfigError, DataError, IdentificationError
-from ...core.files import read_toml
+from ...core.files import did_you_mean, read_toml
 from ...core.rounding import AGREED
-from ...data import Population, read, split_episodes
+from ...data import Population, read
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
 from ...identify import PhaseCalibration
-from ...identify.calibration import segments_of
 from ...identify.survey import RecordingFacts
+from ...identify.unit_phases import Texts, Values, unit_values
 from ...observer import Observer
 from ...observer.screen import SampleStatus
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
-from ...observer.units import recorded_channel, recorded_factors
-from ..config import Stage, StudyConfig, validate_config
-from ..engine.store import Store, open_finished
+from ..config import StudyConfig, validate_config
+from ..engine.store import Store
 from ..stages.learning import ARRAYS
+from ..stages.load import LOAD
 
 log = logging.getLogger(__name__)
-Values = dict[str, dict[str, float]]  # lifting parameters by unit
-Texts = dict[str, str]  # by unit
-# Episode, first sample, columns of estimates and of the tracked parameter, bits: of an episode or a block of it
-Estimated = tuple[EpisodeKey, int, Array, Bits]
+# Episode, first sample, estimates and the tracked parameter, bits, what was recorded: of an episode or a block of it
+Estimated = tuple[EpisodeKey, int, Array, Bits, Array]
 DEPLOYED = ("observers", "deployed.json")
 _BLOCK = 20_000  # samples of an episode that are run at once
 _BATCH = 20  # shorter episodes that run side by side
@@ -97,56 +91,26 @@ def identify_on(store: Store) -> str:
     return RecordingFacts.load(store.path("population")).identify_on
 
 
+def load_observer(store: Store, name: str = "deployed") -> Observer:
+    """Load an observer of a run by its name; that of a load has the channels of the one that is deployed."""
+    if not store.holds(*DEPLOYED):
+        raise ConfigError(f"Run {store.folder}: has no deployed observer; run the study at least until synthesize.")
+    names = load_artifact(store.path("observers"), "observers")[0]["names"]
+    known = {"deployed": DEPLOYED} | {one: ("observers", f"{one}.json") for one in names}
+    known |= {f"{k}/{LOAD}": (LOAD, f"{k}.json") for k in ("koopman", "linear") if store.holds(LOAD, f"{k}.json")}
+    if name not in known:
+        hint = f"{did_you_mean(name, known) or ';'} known are {', '.join(known)}"
+        raise ConfigError(f"Run {store.folder}: has no observer {name!r}{hint}.")
+    chosen = Observer.load(store.path(*known[name]))
+    if chosen.about:
+        return chosen
+    about = Observer.load(store.path(*DEPLOYED)).about
+    return replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
+
+
 def load_calibration(store: Store) -> PhaseCalibration | None:
     """Return the run's calibration, where it has one."""
     return PhaseCalibration.load(store.path("calibration")) if store.holds("calibration", "calibration.json") else None
-
-
-def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
-    """Return the episodes that a unit is identified on: its training part, or its only episode."""
-    groups = {(u, c): keys for u, c, keys in population.groups()}
-    several = tuple(k for keys in groups.values() if len(keys) > 1 for k in keys)
-    splits = split_episodes(replace(population, episodes=several))
-    return groups | {group: split.train for group, split in splits.items()}
-
-
-def unit_values(
-    population: Population, calibration: PhaseCalibration | None, prefer: str, given: Values | None = None
-) -> tuple[Values, Texts, Texts]:
-    """Return the lifting parameters of units, where each came from, and why one is unknown.
-
-    They are given, calibrated in a condition, or those of the run.
-    """
-    known, sources, reasons = {u: dict((given or {}).get(u, {})) for u in population.unit_ids}, Texts(), Texts()
-    if calibration is None:
-        return known, sources, reasons
-    training, spec = training_keys(population), calibration.spec
-    derived = "" if spec.measured in population.states else f" on the derivative of {spec.angle}"
-    for unit, values in known.items():
-        if spec.parameter in values:
-            sources[unit] = "given"
-            continue
-        by_condition = {condition: keys for (u, condition), keys in training.items() if u == unit}
-        keys = by_condition.get(prefer) or next(iter(by_condition.values()))
-        try:
-            phase = calibration.calibrate(segments_of((population, keys, spec)), unit)
-            sources[unit] = f"calibrated{derived}"
-        except IdentificationError as error:
-            if unit not in calibration.units:
-                sources[unit], reasons[unit] = "unknown", str(error)
-                continue
-            phase, sources[unit] = calibration.units[unit], "of the run"
-            log.info("unit %s: its recordings do not determine the phase; the value of the run is used", unit)
-        values[spec.parameter] = phase.phase_rad
-    return known, sources, reasons
-
-
-def unit_parameters(population: Population, calibration: PhaseCalibration | None, prefer: str) -> Values:
-    """Return every unit's lifting parameters, as `unit_values` finds them; refuse one that is unknown."""
-    values, _, reasons = unit_values(population, calibration, prefer)
-    for reason in reasons.values():
-        raise IdentificationError(reason)
-    return values
 
 
 def parse_given(texts: Collection[str], units: Collection[str], known: Collection[str]) -> Values:
@@ -182,9 +146,7 @@ class FieldRecordings:
         cls, config: StudyConfig, store: Store, data: Path, given: Collection[str] = (), track: str | None = None
     ) -> FieldRecordings:
         """Open what `data` names, and settle the parameters of every unit."""
-        if not store.holds(*DEPLOYED):
-            raise ConfigError(f"Run {store.folder}: has no deployed observer; run the study at least until synthesize.")
-        observer = Observer.load(store.path(*DEPLOYED))
+        observer = load_observer(store)
         known = observer.lifting.parameters
         if track is not None and track not in known:
             raise ConfigError(f"--track {track}: the observer's parameters are {', '.join(known) or 'none'}.")
@@ -230,122 +192,28 @@ class FieldRecordings:
         return arriving(self.observer, self.population, {key: self.population.read(key)}, self._parameters)
 
     def estimates(self) -> Iterator[Estimated]:
-        """Run the observer over all episodes: short ones side by side, long ones in blocks."""
-        short: dict[EpisodeKey, Array] = {}
+        """Run the observer over all episodes, block by block."""
         for key in self.population.episodes:
-            blocks = self.population.blocks(key, _BLOCK)
-            first, second = next(blocks), next(blocks, None)
-            if short and (second is not None or len(short) == _BATCH):
-                yield from self._run(tuple(short), [list(short.values())])
-                short = {}
-            if second is None:
-                short[key] = first
-            else:
-                yield from self._run((key,), ([block] for block in chain((first, second), blocks)))
-        if short:
-            yield from self._run(tuple(short), [list(short.values())])
+            yield from self._run(key)
 
-    def _run(self, keys: tuple[EpisodeKey, ...], blocks: Iterable[list[Array]]) -> Iterator[Estimated]:
-        """Run over episodes, block by block, each behind the samples that late measurements are read from."""
+    def _run(self, key: EpisodeKey) -> Iterator[Estimated]:
+        """Run over an episode, every block behind the samples that late measurements are read from."""
         observer, n, start, course = self.observer, len(self.observer.recorded), 0, None
-        loop = None if self.name is None else PhaseLockedLoop(observer, self.name, len(keys))
+        loop = None if self.name is None else PhaseLockedLoop(observer, self.name, 1)
         late = math.ceil(max((s.delay_samples for s in observer.sensor.values()), default=0))
-        before = [np.empty((0, len(self.population.channels)))] * len(keys)
-        for block in blocks:
-            values, lead = [np.concatenate(pair) for pair in zip(before, block, strict=True)], len(before[0])
-            arrived = arriving(observer, self.population, dict(zip(keys, values, strict=True)), self._parameters)
-            course = course or Course(observer, len(keys), arrived.parameters(observer), loop)
+        before = np.empty((0, len(self.population.channels)))
+        for block in self.population.blocks(key, _BLOCK):
+            values, lead = np.concatenate([before, block]), len(before)
+            arrived = arriving(observer, self.population, {key: values}, self._parameters)
+            course = course or Course(observer, 1, arrived.parameters(observer), loop)
             run = course.take(arrived.y[lead:], arrived.u[lead:])
-            columns = run.estimates[..., :n]
+            columns = run.estimates[:, 0, :n]
             if loop is not None:
-                followed = np.broadcast_to(run.followed, columns.shape[:2])
-                columns = np.concatenate([columns, followed[..., None]], axis=-1)
-            for i, key in enumerate(keys):
-                yield key, start, columns[: len(block[i]), i], run.status[: len(block[i]), i]
-            start, before = start + len(block[0]), [part[max(0, len(part) - late) :] for part in values]
+                columns = np.column_stack([columns, np.broadcast_to(run.followed, run.status.shape)[:, 0]])
+            yield key, start, columns, run.status[:, 0], block
+            start, before = start + len(block), values[max(0, len(values) - late) :]
 
 
 def status_counts(status: Bits) -> Counter[str]:
     """Return how many samples are missing, invalid, beyond limits, or restart the observer."""
     return +Counter({str(bit.name): int(np.count_nonzero(status & bit)) for bit in SampleStatus})
-
-
-Write = Callable[[EpisodeKey, int, Array], None]
-ENDINGS = (".parquet", ".csv")
-KEYS = ("unit", "condition", "episode", "k")
-
-
-def estimate_recordings(
-    run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None
-) -> list[str]:
-    """Write ``unit, condition, episode, k, <channel>_hat`` for every sample, then the parameter that is followed.
-
-    Return what people read at the terminal.
-    """
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
-        if out.exists() or out.suffix not in ENDINGS:
-            raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
-        recordings = FieldRecordings.open(config, store, data, given, track)
-        counts = defaultdict[str, Counter[str]](Counter)
-        with writer(out, facts_of(recordings)) as write:
-            factors = recorded_factors(recordings.observer, recordings.observer.recorded)
-            for key, start, columns, status in recordings.estimates():
-                columns[:, : len(factors)] /= factors
-                write(key, start, columns)
-                counts[key.unit].update(status_counts(status))
-    count = len(recordings.population.episodes)
-    return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
-
-
-def unit_lines(sources: Mapping[str, str], counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Return a line a unit with the source of its parameters and its samples by status, where there is any."""
-    lines = []
-    for unit in dict.fromkeys([*sources, *(u for u, of_unit in counts.items() if of_unit)]):
-        parts = [f"parameters {sources[unit]}"] if unit in sources else []
-        parts += [f"{count} samples {bit}" for bit, count in counts.get(unit, {}).items()]
-        lines.append(f"  unit {unit}: {'; '.join(parts)}")
-    return lines
-
-
-def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
-    """Return the observer, columns with their units of measure, and parameters of every unit with their sources."""
-    observer, name = recordings.observer, recordings.name
-    columns = {f"{s}_hat": recorded_channel(observer, s).unit for s in observer.recorded}
-    columns |= {} if name is None else {name: "rad"}
-    parameters = {u: {**recordings.values[u], "source": source} for u, source in recordings.sources.items()}
-    about = {key: observer.about.get(key) for key in ("kros", "study")}
-    return {"observer": observer.name, **about, "columns": columns, "parameters": parameters}
-
-
-@contextmanager
-def writer(out: Path, facts: dict[str, Any]) -> Iterator[Write]:
-    """Give a function that writes an episode's estimates from a sample on; the file appears whole or not at all."""
-    import pyarrow as pa
-    from pyarrow import csv, parquet
-
-    labels = [pa.field(name, pa.int64() if name == "k" else pa.string()) for name in KEYS]
-    units = {name: {"unit": unit} if unit else None for name, unit in facts["columns"].items()}
-    columns = [pa.field(name, pa.float64(), metadata=unit) for name, unit in units.items()]
-    about = {n: v if isinstance(v, str) else json.dumps(v) for n, v in facts.items() if v is not None}
-    schema, text = pa.schema([*labels, *columns], metadata=about), out.suffix == ".csv"
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.partial")
-    try:
-        with (
-            csv.CSVWriter(temporary, schema)
-            if text
-            else parquet.ParquetWriter(temporary, schema, write_page_checksum=True)
-        ) as file:
-
-            def write(key: EpisodeKey, start: int, values: Array) -> None:
-                names = [pa.repeat(name, len(values)) for name in (key.unit, key.condition, key.episode)]
-                samples = pa.array(np.arange(start, start + len(values)))
-                numbers = [pa.array(np.ascontiguousarray(column)) for column in values.T]
-                file.write_table(pa.Table.from_arrays([*names, samples, *numbers], schema=schema), max(len(values), 1))
-
-            yield write
-        if text:
-            write_json(out.with_name(f"{out.name}-metadata.json"), facts)
-        temporary.replace(out)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -11,12 +11,12 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray
 from ...core.errors import KrosError
 from ...identify import Factor, ModelSet
 from ...identify.bootstrap import bootstrap_edmd, episode_weights
@@ -74,21 +74,15 @@ def _noise(context: Context, kind: str, uncertain: UncertainModel) -> Callable[[
     some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
     chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
     recorded = context.identified.factors[context.facts.identify_on]
-    places = [recorded.rows_of(unit) for unit in chosen]
-    used = np.arange(max(map(len, places))) < np.array([[len(rows)] for rows in places])
-    rows = np.zeros(used.shape, dtype=int)
-    rows[used] = np.concatenate(places)
-
-    def by_unit(values: AnyArray) -> AnyArray:
-        values = values[rows]
-        values[~used] = 0
-        return values
-
-    factor = Factor(*(by_unit(getattr(recorded.factor, key)) for key in ("R", "peak", "n_samples")))
+    rows = np.array(list(zip_longest(*map(recorded.rows_of, chosen), fillvalue=-1))).T  # the last one is zero
+    parts = recorded.factor.R, recorded.factor.peak, recorded.factor.n_samples
+    factor = Factor(*(np.concatenate([part, np.zeros_like(part[:1])])[rows] for part in parts))
     lifted = context.identified.models(context.identified.edmd_kinds[0])
     parameters = {key: values[[lifted.index(u) for u in chosen]][:, None] for key, values in lifted.parameters.items()}
     factor = lifted_factor(factor, context.lifting, parameters, models.lifting)
-    return partial(_compared, factor, used.sum(axis=1).tolist(), models, chosen, uncertain.form, uncertain.nominal_id)
+    return partial(
+        _compared, factor, (rows >= 0).sum(axis=1).tolist(), models, chosen, uncertain.form, uncertain.nominal_id
+    )
 
 
 def _compared(

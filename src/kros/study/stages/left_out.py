@@ -25,21 +25,21 @@ from ...data.population import OUTLIERS, Population, split_episodes
 from ...design.task import is_robust
 from ...evaluate.held_out import HeldOut, Outcome
 from ...evaluate.next_unit import fewest_units, next_unit_bound
-from ...identify.calibration import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
-from ...identify.survey import RecordingFacts
+from ...identify.unit_phases import Values, unit_parameters
 from ...observer import Observer
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
 from .evaluate import band_hz, estimation, facts_of, outcomes
 from .learning import FEWEST, LEARNING
 
+Record = dict[str, Any]  # of JSON
+
 log = logging.getLogger(__name__)
 FOLDER, KIND = Stage.LEFT_OUT.value, "left_out"
 NEXT = "next_unit"
 _MEASURES = ("error_percent", "rms")
-Rows = list[dict[str, Any]]
-UnitParameters = dict[str, dict[str, float]]
+Rows = list[Record]
 
 
 def wanted(config: StudyConfig) -> bool:
@@ -72,13 +72,13 @@ def run(context: Context) -> None:
         save_artifact(context.store.draft(FOLDER), KIND, of_folds(context, folds))
 
 
-def results(context: Context) -> dict[str, Any]:
+def results(context: Context) -> Record:
     """Return what the stage adds to the metrics."""
     parts = {FOLDER: context.config.evaluate.folds, NEXT: context.config.evaluate.reserve}
     return {name: load_artifact(context.store.path(name), name)[0] for name, n in parts.items() if n}
 
 
-def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> dict[str, Any]:
+def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> Record:
     """Make the study once for every fold; return the errors on the units that took no part in it."""
     results = []
     context.work.progress.start("left out", len(folds))
@@ -94,7 +94,7 @@ def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> dict[str, Any]
     }
 
 
-def run_fold(whole: Context, number: int, units: Sequence[str]) -> dict[str, Any]:
+def run_fold(whole: Context, number: int, units: Sequence[str]) -> Record:
     """Make the study without some units, and run its observers on these; return the reason where it fails."""
     store = whole.store.nested(FOLDER, str(number))  # which shares results: factors of the same episodes are the same
     context = Context(without(whole, units), store, replace(whole.work, progress=Progress()))
@@ -120,7 +120,8 @@ def without(whole: Context, held: Sequence[str]) -> StudyConfig:
 def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None:
     """Run the observers of a fold on the test episodes of the units that took no part in it."""
     facts, population, record = whole.facts, whole.population.select(held), context.observers_record
-    units, keys = held_parameters(context, population, facts), tuple(k for k in facts.test if k.unit in held)
+    units = unit_parameters(population, context.calibration, facts.identify_on, facts)
+    keys = tuple(k for k in facts.test if k.unit in held)
     episodes = HeldOut(population, keys, units, sensor=context.config.sensor)
     results, band, roles = outcomes(context, estimation(context, episodes)), band_hz(whole), dict.fromkeys(held, FOLDER)
     estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
@@ -131,18 +132,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     save_artifact(context.store.draft("evaluation"), KIND, content)
 
 
-def held_parameters(context: Context, population: Population, facts: RecordingFacts) -> UnitParameters:
-    """Return the lifting parameters of units that took no part in a study, as `kros estimate` finds them."""
-    calibration, held = context.calibration, population.unit_ids
-    if calibration is None:
-        return {unit: {} for unit in held}
-    tasks = [(population.select([u]), calibration_keys(facts, u), calibration.spec) for u in held]
-    segments = context.work.map("calibrate", segments_of, tasks)
-    phases = {u: calibration.calibrate(part, u).phase_rad for u, part in zip(held, segments, strict=True)}
-    return {unit: {calibration.spec.parameter: phase} for unit, phase in phases.items()}
-
-
-def next_unit(context: Context) -> dict[str, Any]:
+def next_unit(context: Context) -> Record:
     """Run the deployed observer on the units in reserve; return what their errors say about the next unit."""
     config, facts, population = context.config.evaluate, context.facts, context.population
     deployed, evaluated = context.observers_record["deployed"], context.evaluation["rows"]
@@ -161,11 +151,11 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     splits = split_episodes(whole, context.config.split.test).values()
     train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
     facts = replace(facts, groups=dict.fromkeys(facts.reserve, ""), train=train, test=test, reserve=())
-    known: UnitParameters = {}
+    known: Values = {}
     failed: dict[str, str] = {}
     for unit in facts.groups:
         try:
-            known |= held_parameters(context, whole.select([unit]), facts)
+            known |= unit_parameters(whole.select([unit]), context.calibration, facts.identify_on, facts)
         except IdentificationError as error:
             failed[unit] = str(error)
     keys, rows = tuple(k for k in test if k.unit in known), Rows()
@@ -179,7 +169,7 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     return rows + [{**base, "unit": u, "condition": c, "channel": s} for u, c in lost for s in whole.states], failed
 
 
-def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> dict[str, Any]:
+def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> Record:
     """Bound the next unit's errors in some channels, in percent and in RMS, all together."""
     places = [(c, m) for c in channels for m in _MEASURES]
     scale = {(c, m): np.mean([r[m] for r in known if r["channel"] == c] or [np.nan]) for c, m in places}
@@ -200,7 +190,7 @@ def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: floa
     return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
 
 
-def facts_of_folds(folds: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+def facts_of_folds(folds: Sequence[dict[str, Record]]) -> dict[str, Record]:
     """Return what all folds together say about every observer."""
     facts = {}
     for name in dict.fromkeys(name for fold in folds for name in fold):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,11 +28,13 @@ from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
 from ...observer import EstimatorSettings, Observer, run_observer
 from ..engine.context import Context
 
+Facts = dict[str, Any]  # of an estimate of the load
+
 log = logging.getLogger(__name__)
 LOAD = "load"
 
 
-@dataclass(frozen=True)
+@frozen
 class TrialSettings:
     """How a load is estimated and judged."""
 
@@ -58,7 +60,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     names = [f"{kind}/{TRIAL.unaware}" for kind, _ in trial.liftings]
     makers |= {f"{n}/current": partial(_from_current, trial, observers[n]) for n in names if n in observers}
     curves: dict[str, Array] = {}
-    facts: dict[str, dict[str, Any]] = {}
+    facts: dict[str, Facts] = {}
     for name, make in makers.items():
         try:
             curves[name], fact = make()
@@ -75,7 +77,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     save_artifact(context.store.draft(LOAD), LOAD, content, single)
 
 
-def load_metrics(context: Context) -> dict[str, Any]:
+def load_metrics(context: Context) -> Facts:
     """Return what `metrics.json` says of the load; nothing where the study declares none."""
     if context.config.load.moment is None:
         return {}
@@ -83,7 +85,7 @@ def load_metrics(context: Context) -> dict[str, Any]:
     return {"load_torque": {key: content[key] for key in ("known", "corner_hz", "settle_s", "observers", "rows")}}
 
 
-def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, dict[str, Any]]:
+def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, Facts]:
     """Return the load of an observer that has it as a state, with its level, and facts; save the observer."""
     (angle, current), test, inputs = trial.places, trial.test, context.population.inputs
     leveled = angle_load(context.config.estimator, trial.dt)
@@ -105,7 +107,7 @@ def angle_load(declared: EstimatorSettings, dt: float) -> AngleLoad:
     return AngleLoad(LoadSettings.level_s, dt, limit=max(map(abs, ends)))
 
 
-def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, dict[str, Any]]:
+def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, Facts]:
     """Return the paper's estimate: the error of the current, scaled where the load is known."""
     current, errors = trial.places[1], []
     for batch in (trial.train, trial.test):
@@ -162,7 +164,7 @@ class LoadTrial:
         """Which test episodes have the load."""
         return np.array([k.condition == TRIAL.condition for k in self.test.keys])
 
-    def row(self, name: str, estimate: Array) -> dict[str, Any]:
+    def row(self, name: str, estimate: Array) -> Facts:
         """Return errors of an estimate for the metrics."""
         skip = round(TRIAL.settle_s / self.dt)
         accuracy = load_accuracy(estimate, self.truth[1], self.dt, TRIAL.judged_hz, skip)

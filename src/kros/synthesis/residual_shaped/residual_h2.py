@@ -96,7 +96,7 @@ def promised_errors(problem: ResidualProblem) -> Array:
         K = shaped.correction(shaped.filter())
     except SynthesisError:
         return np.full(len(shaped.A), np.inf)
-    return np.asarray(np.sqrt(shaped.unit_errors(K).mean(axis=0)))
+    return np.sqrt(shaped.unit_errors(K).mean(axis=0))
 
 
 @frozen
@@ -161,7 +161,7 @@ class _Scaled:
         loop = self.loop(shaping, K)
         if not loop.is_stable():
             return np.full(len(self.A), np.inf)
-        return np.asarray(np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), TINY)))
+        return np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), TINY))
 
     def norm(self, shaping: StateSpace, K: StateSpace) -> float:
         """Root mean square of the scaled error."""
@@ -174,7 +174,7 @@ class _Scaled:
         weight = circle_weights(f)
         drive, rest = response[..., :n], response[..., n:]
         driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real
-        return np.asarray(driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2))
+        return driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2)
 
     def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, most: int) -> StateSpace:
         """Correction filter of the lowest order within the tolerance, by bisection over balanced truncations."""

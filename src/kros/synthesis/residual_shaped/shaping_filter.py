@@ -18,12 +18,11 @@ spectral estimator", IEEE Transactions on Signal Processing 48 (2000) 3189-3205.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.rounding import ITERATED, ROUNDING
@@ -31,7 +30,7 @@ from ...core.rounding import ITERATED, ROUNDING
 _FLOOR = ROUNDING  # white noise of every channel, relative to the largest, which keeps the Gramian regular
 
 
-@dataclass(frozen=True)
+@frozen
 class Basis:
     """Delays and first-order lags of every channel."""
 

@@ -56,7 +56,7 @@ def _bounds(side: tuple[AnyArray, ...], rad: AnyArray, dt: float) -> AnyArray:
     inverse = np.where(values > _RANK, 1 / np.maximum(values, _RANK), 0.0)
     signals = kernel @ adjoint(Vh[:, : values.shape[1]]) * inverse[:, None, :]
     bounds = np.linalg.norm(C @ signals[:, :n] + D @ signals[:, n:], 2, axis=(-2, -1))
-    return np.asarray(bounds * (1 - 100 * (n + m) * EPS * np.maximum(inverse.max(axis=1), 1.0)))
+    return bounds * (1 - 100 * (n + m) * EPS * np.maximum(inverse.max(axis=1), 1.0))
 
 
 def _grid(A: AnyArray, dt: float) -> AnyArray:

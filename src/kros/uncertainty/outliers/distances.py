@@ -107,4 +107,4 @@ def _smooth(level: AnyArray, freqs: AnyArray) -> AnyArray:
     """Moving average over log frequency, to a billionth of a dB."""
     x = np.log10(freqs)
     near = (np.abs(x[:, None] - x) <= OUTLIER.smoothing / 2).astype(float)
-    return np.asarray(np.round(level @ (near / near.sum(axis=0)), 9))
+    return np.round(level @ (near / near.sum(axis=0)), 9)

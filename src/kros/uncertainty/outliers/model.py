@@ -122,7 +122,7 @@ class OutlierModel(Storable):
         """
         first, second = (G / self.output_scale[:, None] * self.input_scale for G in (one, other))
         levels = scaled_levels(self.form, first, second, self._known, self.freqs_hz)
-        return np.asarray(np.median(levels, axis=0) - 10 * np.log10(2.0))
+        return np.median(levels, axis=0) - 10 * np.log10(2.0)
 
     @property
     def extrapolated(self) -> bool:

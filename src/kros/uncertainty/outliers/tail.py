@@ -33,7 +33,7 @@ def prediction_bound(scores: AnyArray, rate: float) -> AnyArray:
     x = np.moveaxis(np.asarray(scores, float), -1, 0)
     if len(x) < LEAST_SCORES:
         return np.full(x.shape[1:], np.inf)
-    return np.asarray(x.max(axis=0) + factor(len(x), rate) * scale(x))
+    return x.max(axis=0) + factor(len(x), rate) * scale(x)
 
 
 def factor(count: int, rate: float) -> float:
@@ -55,7 +55,7 @@ def scales_without_one(levels: AnyArray) -> AnyArray:
 
 
 def _scale(count: int, total: AnyArray, least: AnyArray, largest: AnyArray) -> AnyArray:
-    return np.asarray(np.maximum(total - count * least + largest - least, 0.0) / (count - 1))
+    return np.maximum(total - count * least + largest - least, 0.0) / (count - 1)
 
 
 def excesses(peaks: AnyArray, inliers: Flags) -> AnyArray:
@@ -63,7 +63,7 @@ def excesses(peaks: AnyArray, inliers: Flags) -> AnyArray:
     known = np.where(inliers & np.isfinite(peaks), peaks, -np.inf)
     second, first = np.moveaxis(np.sort(known, axis=-1)[..., -2:], -1, 0)
     largest = np.arange(peaks.shape[-1]) == known.argmax(axis=-1)[..., None]
-    return np.asarray(peaks - np.where(largest, second[..., None], first[..., None]))
+    return peaks - np.where(largest, second[..., None], first[..., None])
 
 
 def margins(levels: AnyArray, inliers: Flags, rate: float) -> tuple[AnyArray, AnyArray]:

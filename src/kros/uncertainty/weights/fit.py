@@ -97,7 +97,7 @@ class _Fit:
         if not weight.left.D.any():
             return np.zeros(0)
         cost = weight.magnitudes(self.freqs_hz).cost_db() - self.optimal.cost_db() - self.fitted.excess_db
-        return np.asarray(self.freqs_hz[_peaks(10 ** ((np.nan_to_num(cost, posinf=0.0) - FIT.missed_db) / 20))])
+        return self.freqs_hz[_peaks(10 ** ((np.nan_to_num(cost, posinf=0.0) - FIT.missed_db) / 20))]
 
     def again(self, missed_hz: AnyArray) -> Weight:
         """Fit again, with the largest residuals at further frequencies."""

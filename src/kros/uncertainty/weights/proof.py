@@ -209,7 +209,7 @@ def _eigenvalues(left: AnyArray, right: AnyArray) -> AnyArray:
         left, right = left * scale, right * scale
     with np.errstate(all="ignore"):
         values = eigvals(left, right)
-    return np.asarray(values[np.isfinite(values)])
+    return values[np.isfinite(values)]
 
 
 @frozen

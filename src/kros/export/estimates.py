@@ -1,0 +1,64 @@
+"""Estimates of a run as a table, CSV or Parquet, written block by block."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.arrays import Array, Bits
+from ..core.artifacts import write_json
+from ..data.population import EpisodeKey
+from ..observer.screen import SampleStatus
+
+Write = Callable[[EpisodeKey, int, Bits, Array], None]
+ENDINGS = (".parquet", ".csv")
+
+
+@contextmanager
+def writer(out: Path, period_s: float, facts: dict[str, Any]) -> Iterator[Write]:
+    """Give a function that writes an episode from a sample on; the file appears whole or not at all.
+
+    Names of CSV columns have the unit of measure in brackets.
+    """
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    text = out.suffix == ".csv"
+    columns = [pa.field(name, pa.string()) for name in ("unit", "condition", "episode")]
+    columns += [pa.field("k", pa.int64()), pa.field("time_s", pa.float64()), pa.field("status", pa.string())]
+    for name, unit in facts["columns"].items():
+        shown = f"{name} [{unit}]" if text and unit else name
+        columns.append(pa.field(shown, pa.float64(), metadata={"unit": unit} if unit else None))
+    about = {n: v if isinstance(v, str) else json.dumps(v) for n, v in facts.items() if v is not None}
+    schema = pa.schema(columns, metadata=about)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_name(f".{out.name}.partial")
+    try:
+        with (
+            csv.CSVWriter(temporary, schema)
+            if text
+            else parquet.ParquetWriter(temporary, schema, write_page_checksum=True)
+        ) as file:
+
+            def write(key: EpisodeKey, start: int, status: Bits, values: Array) -> None:
+                labels = [pa.repeat(name, len(values)) for name in (key.unit, key.condition, key.episode)]
+                k = np.arange(start, start + len(values))
+                labels += [
+                    pa.array(k),
+                    pa.array(k * period_s),
+                    pa.array([SampleStatus(int(bits)).name for bits in status]),
+                ]
+                numbers = [pa.array(np.ascontiguousarray(column)) for column in values.T]
+                file.write_table(pa.Table.from_arrays([*labels, *numbers], schema=schema), max(len(values), 1))
+
+            yield write
+        if text:
+            write_json(out.with_name(f"{out.name}-metadata.json"), facts)
+        temporary.replace(out)
+    finally:
+        temporary.unlink(missing_ok=True)

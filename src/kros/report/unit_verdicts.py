@@ -1,0 +1,155 @@
+"""Verdicts of `kros check` in words, and as CSV, HTML and JUnit XML."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from ..core.artifacts import json_bytes
+from ..core.errors import ConfigError
+from ..core.files import write_bytes
+from ..uncertainty.outliers.score import FEWEST_UNITS, Status
+from .content import Column, Section, build
+from .html import filled
+
+Row = dict[str, Any]  # scores and verdict of a unit in a condition
+
+Rows = list[Row]
+_COLUMNS = [
+    "verdict",
+    "unit",
+    "condition",
+    "status",
+    "score",
+    "threshold",
+    "level_db",
+    "episodes",
+    "recorded_s",
+    "reason",
+]
+
+
+class Verdict(StrEnum):
+    """Verdict on a unit, the worst of its conditions; in the order of severity."""
+
+    PASS = "PASS"
+    UNDECIDED = "UNDECIDED"
+    FAIL = "FAIL"
+
+
+def with_verdict(row: Row) -> Row:
+    """Return a row of scores with its verdict and the reason in words."""
+    verdict = Verdict.PASS if row["status"] == Status.OK else Verdict.UNDECIDED
+    return row | {"verdict": Verdict.FAIL if row["outlier"] else verdict, "reason": "; ".join(_reasons(row))}
+
+
+def by_unit(rows: Sequence[Row]) -> dict[str, tuple[Verdict, list[str]]]:
+    """Return the verdict on every unit, and the reason of every condition."""
+    units: dict[str, list[Row]] = {}
+    for row in rows:
+        units.setdefault(row["unit"], []).append(row)
+    return {u: (worst(of), [f"{row['condition']}: {row['reason']}" for row in of]) for u, of in units.items()}
+
+
+def worst(rows: Sequence[Row]) -> Verdict:
+    """Return the verdict of rows together: FAIL before UNDECIDED before PASS."""
+    return max((Verdict(row["verdict"]) for row in rows), key=list(Verdict).index)
+
+
+def verdict_lines(rows: Sequence[Row]) -> list[str]:
+    """Return the word and the name of every unit, each followed by an indented line for every condition."""
+    units = by_unit(rows).items()
+    return [line for u, (v, reasons) in units for line in (f"{v:<9}  {u}", *(f"  {text}" for text in reasons))]
+
+
+def csv_text(rows: Rows) -> str:
+    """Return a line for every unit and condition."""
+    text = io.StringIO()
+    table = csv.DictWriter(text, _COLUMNS, extrasaction="ignore", lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    return text.getvalue()
+
+
+def html_text(rows: Rows) -> str:
+    """Return a page with a table of units and conditions."""
+    columns = [
+        Column(name, [str(row.get(name)) for row in rows]) for name in ("unit", "condition", "verdict", "reason")
+    ]
+    section = Section("units", "Units", tables=[build("", columns, prose=True)])
+    return filled("kros check", worst(rows), [section])
+
+
+def junit_text(rows: Sequence[Row]) -> str:
+    """Return JUnit XML with a test case for every unit; UNDECIDED is an error, so that a build does not pass on it."""
+    units, tags = by_unit(rows), {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}
+    counts = {f"{tag}s": str(sum(v is verdict for v, _ in units.values())) for verdict, tag in tags.items()}
+    suite = ElementTree.Element("testsuite", {"name": "kros check", "tests": str(len(units)), **counts})
+    for unit, (verdict, reasons) in units.items():
+        case = ElementTree.SubElement(suite, "testcase", classname="kros.check", name=_printable(unit))
+        if verdict in tags:
+            message = _printable("; ".join(reasons))
+            ElementTree.SubElement(case, tags[verdict], type=verdict.value, message=message)
+    ElementTree.indent(suite)
+    return ElementTree.tostring(suite, "utf-8", xml_declaration=True).decode()
+
+
+def _printable(text: str) -> str:
+    """Return a text in which what cannot be printed is an underscore."""
+    return "".join(c if c.isprintable() else "_" for c in text)
+
+
+def _reasons(row: Row) -> list[str]:
+    """Return what a verdict rests on."""
+    reasons = []
+    if row["score"] is not None and row["threshold"] is not None:
+        reasons.append(f"score {row['score']:.2f} dB, threshold {row['threshold']:.2f} dB")
+    if row["status"] == Status.NOT_ENOUGH_DATA:
+        reasons.append(f"about {row['needed_s']:.3g} s of recordings are needed, found {row['recorded_s']:.3g} s")
+    elif row["status"] == Status.CANNOT_TELL and "missing" not in row and row["units"] < FEWEST_UNITS:
+        reasons.append(f"needs at least {FEWEST_UNITS} units to compare with, has {row['units']}")
+    elif row["status"] == Status.OTHER_MOTIONS:
+        less = "beyond the others, but by no more than one unit differs from motion to motion"
+        reasons.append(f"{less}; repeat the motions of the study")
+    elif row.get("detectable") is not None and not row["outlier"]:
+        only = "only " if row["status"] == Status.CANNOT_TELL else ""
+        change = f"{only}a change of gain above {row['detectable']:.2g} % would be detected"
+        reasons.append(f"{change}, at {row['detectable_hz']:.3g} Hz")
+    if "missing" in row:
+        reasons.append(f"no score without {', '.join(row['missing'])}")
+    if row.get("level_db") is not None:
+        few = f", from {row['level_units']} units of which {FEWEST_UNITS} are needed"
+        place = f"{abs(row['level_db']):.2f} dB {'over' if row['level_db'] > 0 else 'below'} the monitor's bound"
+        reasons.append(f"innovation {place}{few if row['level_units'] < FEWEST_UNITS else ''}")
+    elif "missing" in row:
+        reasons.append("the deployed observer has no monitor, or no sample can be judged")
+    if row["left_out"]:
+        reasons.append(f"compared without {', '.join(row['left_out'])}, which is the same machine")
+    reasons += [f"{count} samples {bit}" for bit, count in row.get("samples", {}).items()]
+    return reasons + ([f"parameters {row['parameters']}"] if row.get("parameters") else [])
+
+
+FORMATS: dict[str, Callable[[Rows], str]] = {
+    ".csv": csv_text,
+    ".html": html_text,
+    ".json": lambda rows: json_bytes(rows).decode(),
+    ".xml": junit_text,
+}
+
+
+def file_writer(paths: Sequence[Path]) -> Callable[[Rows], None]:
+    """Return what writes verdicts to files, by their endings; refuse one that cannot be written."""
+    for path in paths:
+        if path.is_dir() or not path.absolute().parent.is_dir() or path.suffix not in FORMATS:
+            raise ConfigError(f"--out {path}: name a file in an existing folder that ends in {', '.join(FORMATS)}.")
+
+    def write(rows: Rows) -> None:
+        for path in paths:
+            write_bytes(path, FORMATS[path.suffix](rows).encode())
+
+    return write

@@ -1,0 +1,82 @@
+"""`kros estimate`: estimates beside what was recorded, with time, status and error band, in the recordings' units."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...core.artifacts import load_artifact
+from ...core.errors import ConfigError
+from ...core.files import write_bytes
+from ...export.estimates import ENDINGS, writer
+from ...observer.units import recorded_channel, recorded_factors
+from ..config import Stage
+from ..engine.store import open_finished
+from .field import FieldRecordings, status_counts
+
+
+def estimate_recordings(
+    run: Path,
+    data: Path,
+    out: Path,
+    given: Collection[str] = (),
+    track: str | None = None,
+    plot: Path | None = None,
+) -> list[str]:
+    """Write what `facts_of` names for every sample, and a plot of the first episode; return what people read.
+
+    The band is the bound of the RMS error for recorded signals, where the observer has one and the sample is good.
+    """
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
+        if out.exists() or out.suffix not in ENDINGS:
+            raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
+        if plot is not None and plot.suffix != ".png":
+            raise ConfigError(f"--plot {plot}: should end in .png.")
+        recordings = FieldRecordings.open(config, store, data, given, track)
+        observer, population = recordings.observer, recordings.population
+        names = observer.recorded
+        stated = load_artifact(store.path("observers"), "observers")[0]["facts"].get(observer.name, {})
+        bound = np.array([stated.get("set_bound", {}).get(name) for name in names], dtype=float)
+        factors = recorded_factors(observer, [*(c.name for c in population.channels), *names])
+        counts, n, first = defaultdict[str, Counter[str]](Counter), len(names), None
+        with writer(out, population.sample_period_s, facts_of(recordings)) as write:
+            for key, start, columns, status, recorded in recordings.estimates():
+                band = np.where(status[:, None] == 0, bound / np.abs(factors[-n:]), np.nan)
+                values = np.hstack([np.hstack([recorded, columns[:, :n]]) / factors, band, columns[:, n:]])
+                write(key, start, status, values)
+                counts[key.unit].update(status_counts(status))
+                first = values if first is None else first
+    if plot is not None and first is not None:
+        from ...report.estimates import estimates_png
+
+        drawn = dict(zip(facts_of(recordings)["columns"], first.T, strict=True))
+        units = {name: recorded_channel(observer, name).unit for name in names}
+        write_bytes(plot, estimates_png(population.sample_period_s, drawn, units))
+    count = len(population.episodes)
+    return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
+
+
+def unit_lines(sources: Mapping[str, str], counts: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Return a line a unit with the source of its parameters and its samples by status, where there is any."""
+    lines = []
+    for unit in dict.fromkeys([*sources, *(u for u, of_unit in counts.items() if of_unit)]):
+        parts = [f"parameters {sources[unit]}"] if unit in sources else []
+        parts += [f"{count} samples {bit}" for bit, count in counts.get(unit, {}).items()]
+        lines.append(f"  unit {unit}: {'; '.join(parts)}")
+    return lines
+
+
+def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
+    """Return the observer, columns with their units of measure, and parameters of every unit with their sources."""
+    observer, name = recordings.observer, recordings.name
+    columns = {c.name: recorded_channel(observer, c.name).unit for c in recordings.population.channels}
+    for ending in ("hat", "band"):
+        columns |= {f"{state}_{ending}": recorded_channel(observer, state).unit for state in observer.recorded}
+    columns |= {} if name is None else {name: "rad"}
+    parameters = {u: {**recordings.values[u], "source": source} for u, source in recordings.sources.items()}
+    about = {key: observer.about.get(key) for key in ("kros", "study")}
+    return {"observer": observer.name, **about, "columns": columns, "parameters": parameters}

@@ -1,0 +1,82 @@
+"""`kros watch`: new recordings are checked as they arrive, with a line and a result file each, whatever kills it.
+
+The result file is named by the recording, its size and the time of its last change; it is written beside and renamed.
+What has one is done, all else is not, and nothing else is remembered. A recording at rest is the same in two looks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ...core.artifacts import digest_of, write_json
+from ...core.errors import ConfigError, KrosError
+from ...core.files import draft_beside, is_file, link_or_copy, stamp_of
+from ...data.readers.parquet import INDEX
+from ...report.unit_verdicts import worst
+from ..config import StudyConfig
+from ..engine.lock import locked
+from ..engine.store import Store, load_run, open_finished
+from .check import STAGES, verdicts
+
+Waiting = dict[Path, Path]  # recordings, a file or a folder of Parquet, by where their results will be
+
+
+def watch(folder: Path, run: Path, out: Path | None, every_s: float, once: bool) -> Iterator[str]:
+    """Yield a line for every recording without a result, once it is at rest; `once`: until all have one."""
+    folder = folder.absolute()
+    out = folder.with_name(f"{folder.name}-results") if out is None else out.absolute()
+    if not folder.is_dir():
+        raise ConfigError(f"Watching {folder}: there is no such folder; name the one that recordings arrive in.")
+    load_run(run)
+    out.mkdir(parents=True, exist_ok=True)
+    before: Waiting = {}
+    with locked(out):
+        Store(out).tidy()
+        while (now := waiting(folder, out)) or not once:
+            if rest := {place: path for place, path in now.items() if place in before}:
+                with open_finished(run, *STAGES) as (config, store):
+                    for place, path in rest.items():
+                        yield from judged(config, store, path, place, folder, out)
+            before = now
+            time.sleep(every_s)
+
+
+def waiting(folder: Path, out: Path) -> Waiting:
+    """Return recordings without a result."""
+    found: Waiting = {}
+    populations = {index.parent: index for index in folder.rglob(f"{INDEX}.json")}
+    files = {path: path for path in folder.rglob("*") if is_file(path) and populations.keys().isdisjoint(path.parents)}
+    for path, changing in sorted((populations | files).items()):
+        if out not in path.parents and not path.name.startswith("."):
+            with suppress(FileNotFoundError):  # it has just gone
+                found[place_of(path, changing, folder, out)] = path
+    return {place: path for place, path in found.items() if not place.exists()}
+
+
+def place_of(path: Path, changing: Path, folder: Path, out: Path) -> Path:
+    """Return the file of a result; of a folder of Parquet, the index changes last."""
+    return out / f"{path.relative_to(folder.parent)}.{digest_of(stamp_of(changing))[:12]}.json"
+
+
+def judged(config: StudyConfig, store: Store, path: Path, place: Path, folder: Path, out: Path) -> Iterator[str]:
+    """Check one recording, alone in a folder like its own, and write its result; yield its line, none if it changed."""
+    name, result = str(path.relative_to(folder)), dict[str, Any]()
+    with draft_beside(out) as draft:
+        try:
+            if path.is_file():
+                target = draft / name
+                target.parent.mkdir(parents=True)
+                link_or_copy(path, target)
+            rows = verdicts(config, store, draft if path.is_file() else path)
+            result = {"verdict": worst(rows), "reason": "; ".join(row["reason"] for row in rows), "rows": rows}
+        except (KrosError, OSError) as error:
+            reason = str(error).replace(str(draft), str(folder))
+            result = {"verdict": "refused", "reason": reason, "rows": []}
+    with suppress(FileNotFoundError):
+        if place == place_of(path, path if path.is_file() else path / f"{INDEX}.json", folder, out):
+            write_json(place, {"schema": 1, "recording": name} | result)
+            yield f"{result['verdict']:<9}  {name}: {result['reason']}"

@@ -1,0 +1,81 @@
+"""`kros watch`: each recording is judged once, whatever kills it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from watch import campaign, make_study, recording
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    return make_study(tmp_path_factory.mktemp("watched"))
+
+
+def results(out: Path) -> dict[str, list[dict]]:
+    found: dict[str, list[dict]] = {}
+    for path in out.rglob("*.json"):
+        content = json.loads(path.read_text())
+        found.setdefault(content["recording"], []).append(content)
+    return found
+
+
+def test_recordings_under_kills_are_judged_once(tmp_path) -> None:
+    counts = campaign(tmp_path / "few", 20, 2, pause_s=0.01)
+    assert (counts["recordings with one result"], counts["with more"], counts["judged twice"]) == (20, 0, 0)
+    assert sum(counts["verdicts"].values()) == 20
+
+
+def test_damaged_files_are_refused_and_the_watch_goes_on(kros, run, tmp_path) -> None:
+    new = tmp_path / "new"
+    (new / "deeper").mkdir(parents=True)
+    (new / "a_0.csv").write_text("nothing")
+    (new / "b_0.csv").write_bytes(bytes(range(256)))
+    (new / "deeper" / "n01_0.csv").write_text(recording(7))
+    (new / ".hidden").write_text("is left alone")
+    result = kros("watch", new, run, "--every", 0.05, "--once")
+    assert result.exit_code == 0, result.output
+    lines = [line.split()[:2] for line in result.stdout.splitlines()]
+    assert lines[:2] == [["refused", "a_0.csv:"], ["refused", "b_0.csv:"]]
+    assert [name for _, name in lines[2:]] == ["deeper/n01_0.csv:"]
+    found = results(tmp_path / "new-results")
+    assert set(found) == {"a_0.csv", "b_0.csv", "deeper/n01_0.csv"}
+    assert str(new) in found["a_0.csv"][0]["reason"]
+    assert found["deeper/n01_0.csv"][0]["rows"][0]["unit"] == "n01"
+    assert kros("watch", new, run, "--every", 0.05, "--once").stdout == ""
+    (new / "a_0.csv").write_text(recording(8))
+    assert kros("watch", new, run, "--every", 0.05, "--once").stdout.split()[1] == "a_0.csv:"
+    assert len(results(tmp_path / "new-results")["a_0.csv"]) == 2  # another file of that name
+    assert kros("watch", tmp_path / "none", run).exit_code == 2
+    assert kros("watch", new, tmp_path).exit_code == 2
+
+
+def test_a_growing_file_is_waited_for_and_sigterm_ends_cleanly(run, tmp_path) -> None:
+    new, text = tmp_path / "new", recording(9)
+    new.mkdir()
+    command = [sys.executable, "-m", "kros", "watch", str(new), str(run), "--every", "0.3"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
+        with (new / "n01_0.csv").open("w") as file:
+            for k in range(30):
+                file.write(text[k * len(text) // 30 : (k + 1) * len(text) // 30])
+                file.flush()
+                assert not list((tmp_path / "new-results").rglob("*.json"))
+                time.sleep(0.05)
+        assert "n01_0.csv" in watch.stdout.readline()
+        second = subprocess.run(command, capture_output=True, text=True)
+        assert second.returncode == 2  # another one is at work there
+        watch.send_signal(signal.SIGTERM)
+        assert watch.wait() == 143
+        assert "Traceback" not in watch.stderr.read()
+    assert [
+        name for name in os.listdir(tmp_path / "new-results") if name.startswith(".kros.") and "lock" not in name
+    ] == []

@@ -148,6 +148,13 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     )
 
 
+def test_a_start_without_time_constants_of_its_own_is_that_of_the_lags(exact):
+    recordings, _ = plant(units=3, spread=0.1)
+    bank = design(recordings, settings=FEW.model_copy(update={"start": ()})).bank
+    assert bank.starts == bank.lags
+    assert np.isfinite(Readout.of(design(recordings, settings=FEW.model_copy(update={"start": ()}))).typical).all()
+
+
 def test_few_episodes_of_the_regression_leave_no_group_without_moments():
     recordings, _ = plant(units=5, episodes=7, spread=0.1)
     settings = FEW.model_copy(update={"episodes": 4})

@@ -92,7 +92,7 @@ def deployed(facts: Facts) -> Rows:
         "reasons": " ".join(reason.text for reason in verdict.reasons),
         "states": facts.entry.get("order"),
         "settles after (samples)": facts.entry.get("settle_samples"),
-        "time of the study (s)": float(facts.get("timing_s", {}).get("total", 0.0)),
+        "time of the study (s)": facts.get("timing_s", {}).get("total"),
     }
 
 

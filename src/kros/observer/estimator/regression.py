@@ -144,7 +144,7 @@ class Design:
 
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
         """
-        samples = thinned(recordings.lengths, rows, round(10 * max(self.settings.start)))
+        samples = thinned(recordings.lengths, rows, round(10 * max(self.settings.start, default=0.0)))
         measured = list(self.channels.measured)
         for key, (at, weights) in zip(recordings.keys, samples, strict=True):
             states, y, v = self.episode(key, offset)

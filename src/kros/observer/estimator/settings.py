@@ -47,6 +47,7 @@ class EstimatorSettings(Settings):
     sample: int = Field(8_000, ge=1000, description="rows from which principal directions and covariances are found")
     penalties: tuple[float, ...] = Field(
         tuple(10.0**decade for decade in range(-16, 1, 2)),
+        min_length=1,
         description="penalties of the regression that are tried, relative to the bank's power",
     )
     parts: int = Field(3, ge=1, description="parts of the episodes, of which the one that is judged on is left out")
@@ -68,11 +69,13 @@ class EstimatorSettings(Settings):
     )
     halves: tuple[float, ...] = Field(
         (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
+        min_length=1,
         description="ages of a gap at which the fallback counts one half, in longest delays; training chooses, "
         "among every other one for measured states",
     )
     recoveries: tuple[float, ...] = Field(
         (0.3, 3.0, 30.0),
+        min_length=1,
         description="time constants of the age when measurements return, in longest delays; training chooses",
     )
     room: float = Field(

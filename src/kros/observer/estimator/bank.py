@@ -21,6 +21,8 @@ from ...core.rounding import ITERATED
 from .channels import Channels
 from .settings import EstimatorSettings
 
+_BLOCK, _ROWS = 32, 1000  # samples of a block, and rows at a time
+
 
 @frozen
 class Bank:
@@ -129,7 +131,23 @@ class Bank:
 
 
 def lagged(v: Array, a: Array, at: Whole) -> Array:
-    """Return ``h_k = a h_{k-1} + (1 - a) v_k``, ``h_{-1} = v_0``, at some samples, shape (len(at), a by channels)."""
+    """Return ``h_k = a h_{k-1} + (1 - a) v_k``, ``h_{-1} = v_0``, at some samples, shape (len(at), a by channels).
+
+    A recursion over blocks of samples, and sums within the block of every sample asked for.
+    """
     from scipy.signal import lfilter
 
-    return np.hstack([lfilter([1 - b], [1, -b], v, axis=0, zi=b * v[:1])[0][at] for b in a])
+    count, channels = -(-len(v) // _BLOCK), v.shape[1]
+    blocks = np.concatenate([v, np.repeat(v[-1:], count * _BLOCK - len(v), axis=0)]).reshape(count, _BLOCK, channels)
+    age = np.subtract.outer(np.arange(_BLOCK), np.arange(_BLOCK))
+    shares = ((1 - a) * a ** np.maximum(age, 0)[..., None] * (age >= 0)[..., None]).swapaxes(1, 2)  # to, lag, from
+    sums, decay = shares[-1] @ blocks, a**_BLOCK
+    ends = [lfilter([1], [1, -b], sums[:, i], axis=0, zi=b * v[:1])[0] for i, b in enumerate(decay)]
+    before = np.concatenate([np.repeat(v[None, :1], len(a), axis=1), np.stack(ends, axis=1)])
+    block, place = np.divmod(at, _BLOCK)
+    gone = a ** (place + 1)[:, None]
+    parts = [  # some rows at a time, for the sake of memory
+        gone[some, :, None] * before[block[some]] + shares[place[some]] @ blocks[block[some]]
+        for some in np.split(np.arange(len(at)), range(_ROWS, len(at), _ROWS))
+    ]
+    return np.concatenate(parts).reshape(len(at), -1)

@@ -20,7 +20,7 @@ from .certificate import outside_percent
 from .channels import FAMILIES, Channels, channels_of
 from .gaps import with_gaps
 from .reduction import Filters, reduced
-from .regression import Design, Readout, Recordings, is_less
+from .regression import Design, Readout, Recordings, is_less, samples
 from .settings import EstimatorSettings
 
 
@@ -82,21 +82,20 @@ def identify_estimator(
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(measured)
     require_known(settings.unbounded, [lifting.states[i] for i in measured], inputs)
-    readout, family = best_family(lifting, measured, inputs, recordings, settings, hidden)
+    readout, blind, family = best_family(lifting, measured, inputs, recordings, settings, hidden)
     channels = readout.design.channels
-    blind_channels = channels.without_measurements()
-    blind = Readout.of(Design.of(blind_channels, recordings, settings))
-    held = [measured[i] for i in blind_channels.held]
+    held = [measured[i] for i in blind.design.channels.held]
     reach = settings.reach * recordings.size[list(measured)]
 
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
         return assembled(name, lifting, inputs, channels, (filters, fallback), sample_period_s, parameters or {}, reach)
 
-    filters, fallback = (reduced(r, settings.order) for r in (readout, blind))
+    pairs = list(zip((readout, blind), samples([readout.design.fine, blind.design.fine]), strict=True))
+    filters, fallback = (reduced(*pair, settings.order) for pair in pairs)
     observer = observer_of(filters, fallback)
     group, unseen = readout.left_out_group()
-    smaller = (filters, readout), (fallback, blind)
-    trial = observer_of(*(reduced(r.without(group), len(f.A)) for f, r in smaller))
+    orders = len(filters.A), len(fallback.A)
+    trial = observer_of(*(reduced(r.without(group), fine, n) for (r, fine), n in zip(pairs, orders, strict=True)))
     assert observer.bank is not None
     bank = with_gaps(observer.bank, trial, unseen, settings, held)
     observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings))
@@ -154,22 +153,27 @@ def best_family(
     recordings: Recordings,
     settings: EstimatorSettings,
     hidden: Sequence[int],
-) -> tuple[Readout, str]:
-    """Return the readout of the first family after which the next is not better by the margin on left-out units."""
+) -> tuple[Readout, Readout, str]:
+    """Return the readout of the first family after which the next is not better by the margin on left-out units.
+
+    Beside it stands that of inputs alone. The families before the richest are fitted in one go.
+    """
     names, n = [*lifting.states, *inputs], lifting.n_states
     ends = (lifting.sizes_of(names) * recordings.ranges).T.tolist()
     known = [*measured, *range(n, len(names))]
     ranges = {names[i]: (ends[i][0], ends[i][1]) for i in known}
-    best: list[tuple[Readout, str]] = []
-    for family in FAMILIES:
-        design = Design.of(channels_of(lifting, measured, inputs, family, ranges, settings), recordings, settings)
-        if best and len(design.bank) == len(best[-1][0].design.bank):
+    channels = [channels_of(lifting, measured, inputs, family, ranges, settings) for family in FAMILIES]
+    designs = [Design.of(c, recordings, settings) for c in (*channels, channels[0].without_measurements())]
+    *plain, blind = Readout.of([*designs[:-2], designs[-1]])
+    best, family, following = plain[0], FAMILIES[0], iter(plain[1:])
+    for name, design in zip(FAMILIES[1:], designs[1:-1], strict=True):
+        if len(design.bank) == len(best.design.bank):
             break
-        readout = Readout.of(design)
-        if best and not is_less(readout.by_fold(hidden), best[-1][0].by_fold(hidden), settings.margin):
+        richer = next(following, None) or Readout.of([design])[0]
+        if not is_less(richer.by_fold(hidden), best.by_fold(hidden), settings.margin):
             break
-        best.append((readout, family))
-    return best[-1]
+        best, family = richer, name
+    return best, blind, family
 
 
 def assembled(

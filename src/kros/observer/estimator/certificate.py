@@ -95,7 +95,7 @@ def outside_percent(readout: Readout, modelled: Lifting) -> Array:
     known = {*own.states, *_signals(modelled, own.inputs), CONSTANT}
     texts = [*own.states, *_signals(own, own.inputs)]
     outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
-    rows, weight = design.sample
+    rows, weight = readout.sample
     added = rows[:, outside] @ readout.coefficients[outside]
     return 100 * np.sqrt(weight @ added**2) / design.recordings.size
 

@@ -55,13 +55,16 @@ class Filters:
         return z @ self.C.T + v @ self.D.T
 
 
-def reduced(readout: Readout, order: int | None = None) -> Filters:
-    """Return the filters of a readout, reduced until left-out errors grow by a share, or to an order."""
+def reduced(readout: Readout, fine: tuple[Array, Array], order: int | None = None) -> Filters:
+    """Return the filters of a readout, reduced until left-out errors grow by a share, or to an order.
+
+    The covariance is that of thinned rows of the bank with every delay, with their weights.
+    """
     design = readout.design
     errors = readout.typical * design.recordings.size
     A, B, S = design.bank.fine.system()
     weights = design.bank.refined(readout.coefficients).T
-    X, w = design.fine_sample
+    X, w = fine
     size = np.sqrt(w @ (X * X))
     size = np.where(size > 0, size, 1.0)
     A, B, S = A * size / size[:, None], B / size[:, None], S / size[:, None]

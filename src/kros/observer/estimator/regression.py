@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import compress
 from typing import TypeVar
 
@@ -29,6 +29,7 @@ from .settings import EstimatorSettings
 
 T = TypeVar("T", bound=Hashable)
 Read = Callable[[EpisodeKey], EpisodeBatch]
+Rows = tuple[EpisodeKey, Array, Array, Array]  # rows of the bank, targets and weights
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
 
 
@@ -139,7 +140,7 @@ class Design:
 
     def rows(
         self, recordings: Recordings, rows: int, offset: Array | float = 0.0
-    ) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
+    ) -> Iterator[Rows]:
         """Yield episode, bank rows, targets and weights of every episode, with an offset of the measurements.
 
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
@@ -147,16 +148,15 @@ class Design:
         samples = thinned(recordings.lengths, rows, round(10 * max(self.settings.start, default=0.0)))
         measured = list(self.channels.measured)
         for key, (at, weights) in zip(recordings.keys, samples, strict=True):
-            states, y, v = self.episode(key, offset)
+            states, y, v = self.episode(recordings.read(key), offset)
             targets = states[at + 1] / recordings.size
             reference = v[at] @ self.channels.reference.T
             reference[:, self.channels.held] = y[at][:, self.channels.held]
             targets[:, measured] -= reference / recordings.size[measured]
             yield key, self.bank.rows(self.channels.filtered(v), at), targets, weights
 
-    def episode(self, key: EpisodeKey, offset: Array | float = 0.0) -> tuple[Array, Array, Array]:
+    def episode(self, batch: EpisodeBatch, offset: Array | float = 0.0) -> tuple[Array, Array, Array]:
         """Return states, measurements with an offset, and channels of an episode, (n_samples, .)."""
-        batch = self.recordings.read(key)
         length, own = batch.lengths[0], {k: p[0] for k, p in batch.parameters.items()}
         y = interpolated(batch.measurements(self.channels.measured)[:length, 0]) + offset
         return batch.states[:length, 0], y, self.channels.signals(y, batch.inputs[:length, 0], own)
@@ -165,7 +165,8 @@ class Design:
         """Return what filters see in some episodes, cut to one length, shape (n_samples, batch, channels)."""
         recordings = self.recordings.some(some)
         shortest = min(length, *recordings.lengths)
-        return np.stack([self.channels.filtered(self.episode(key)[2])[:shortest] for key in recordings.keys], axis=1)
+        channels = (self.episode(batch)[2] for batch in map(recordings.read, recordings.keys))
+        return np.stack([self.channels.filtered(v)[:shortest] for v in channels], axis=1)
 
     @cached_property
     def groups(self) -> dict[EpisodeKey, Group]:
@@ -174,23 +175,26 @@ class Design:
         names, units = (sorted(set(column)) for column in zip(*((k.episode, k.unit) for k in keys), strict=True))
         return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
 
-    @cached_property
-    def fine_sample(self) -> tuple[Array, Array]:
-        """Thinned rows of the bank with every delay, and weights that sum to one."""
-        return replace(self, bank=self.bank.fine).thinned()
+    @property
+    def fine(self) -> Design:
+        """The design of the bank with every delay."""
+        return replace(self, bank=self.bank.fine)
 
-    @cached_property
-    def sample(self) -> tuple[Array, Array]:
-        """Thinned rows of the bank, sums of those with every delay, and their weights."""
-        rows, weights = self.fine_sample
-        return rows @ self.bank.refined(np.eye(len(self.bank))), weights
 
-    def thinned(self, offset: Array | float = 0.0) -> tuple[Array, Array]:
-        """Return thinned rows of the bank with an offset of the measurements, and weights that sum to one."""
-        settings = self.settings
-        parts = list(self.rows(self.recordings.some(settings.episodes // 2), settings.sample, offset))
-        weights = np.concatenate([w for *_, w in parts])
-        return np.vstack([rows for _, rows, _, _ in parts]), weights / weights.sum()
+def in_step(
+    designs: Sequence[Design], recordings: Recordings, rows: int, offset: Array | float = 0.0
+) -> Iterator[tuple[Rows, ...]]:
+    """Yield what `Design.rows` yields of several designs, episode by episode: each is read once."""
+    once = replace(recordings, read=lru_cache(maxsize=1)(recordings.read))
+    return zip(*(design.rows(once, rows, offset) for design in designs), strict=True)
+
+
+def samples(designs: Sequence[Design], offset: Array | float = 0.0) -> list[tuple[Array, Array]]:
+    """Return thinned rows of the bank of every design, with an offset of measurements, and weights that sum to one."""
+    recordings, settings = designs[0].recordings, designs[0].settings
+    episodes = list(in_step(designs, recordings.some(settings.episodes // 2), settings.sample, offset))
+    weights = np.concatenate([w for (*_, w), *_ in episodes])
+    return [(np.vstack([rows for _, rows, *_ in of_one]), weights / weights.sum()) for of_one in zip(*episodes)]
 
 
 def interpolated(y: Array) -> Array:
@@ -215,14 +219,14 @@ class Whitening:
     trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
 
     @classmethod
-    def of(cls, design: Design) -> Whitening:
-        """Find the directions from thinned rows."""
-        X, weights = design.sample
+    def of(cls, design: Design, sample: tuple[Array, Array]) -> Whitening:
+        """Find the directions from thinned rows, with their weights."""
+        X, weights = sample
         size = design.bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
         trust, bias = np.diag(design.bank.trust(design.settings)), design.recordings.bias
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
-            moved = (design.thinned(bias)[0] - X) * scale
+            moved = (samples([design], bias)[0][0] - X) * scale
             trust = np.vstack([trust, qr_triangle(moved)])
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
@@ -242,15 +246,21 @@ class Moments:
     power: Array  # (groups, n)
 
     @classmethod
-    def of(cls, design: Design, whitening: Whitening) -> Moments:
-        """Sum the rows of every group."""
-        sums, groups, r = dict[Group, Array](), design.groups, whitening.directions.shape[1]
-        recordings = design.recordings.some(design.settings.episodes, groups)
-        for key, rows, targets, weights in design.rows(recordings, design.settings.rows):
-            columns = np.hstack([rows @ whitening.directions, targets, np.ones((len(rows), 1))])
-            columns *= np.sqrt(weights)[:, None]
-            sums[groups[key]] = sums.get(groups[key], 0.0) + columns.T @ columns
-        total = np.stack([*sums.values()])
+    def of(cls, designs: Sequence[Design], whitenings: Sequence[Whitening]) -> list[Moments]:
+        """Sum the rows of every group, for every design."""
+        groups, settings = designs[0].groups, designs[0].settings
+        sums: list[dict[Group, Array]] = [{} for _ in designs]
+        for episode in in_step(designs, designs[0].recordings.some(settings.episodes, groups), settings.rows):
+            for total, whitening, (key, rows, targets, weights) in zip(sums, whitenings, episode, strict=True):
+                columns = np.hstack([rows @ whitening.directions, targets, np.ones((len(rows), 1))])
+                columns *= np.sqrt(weights)[:, None]
+                total[groups[key]] = total.get(groups[key], 0.0) + columns.T @ columns
+        return [cls._of_sums(whitening, total) for whitening, total in zip(whitenings, sums, strict=True)]
+
+    @classmethod
+    def _of_sums(cls, whitening: Whitening, sums: Mapping[Group, Array]) -> Moments:
+        """Return the moments of sums of squares and products of whitened rows, targets and ones."""
+        r, total = whitening.directions.shape[1], np.stack([*sums.values()])
         total /= total[:, -1:, -1:]
         power = np.diagonal(total, axis1=1, axis2=2)[:, r:-1]
         return cls(whitening, tuple(sums), total[:, :r, :r], total[:, :r, r:-1], power)
@@ -298,6 +308,7 @@ class Readout:
     """Coefficients of all states on a bank, in the channels' units, with errors on units and episodes left out."""
 
     design: Design
+    sample: tuple[Array, Array]  # thinned rows of the bank, with their weights
     coefficients: Array  # (p, n)
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
@@ -305,10 +316,16 @@ class Readout:
     others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
 
     @classmethod
-    def of(cls, design: Design) -> Readout:
+    def of(cls, designs: Sequence[Design]) -> list[Readout]:
+        """Fit all states by every design, in two passes over the recordings."""
+        sampled = samples(designs)
+        moments = Moments.of(designs, [Whitening.of(*pair) for pair in zip(designs, sampled, strict=True)])
+        return [cls._fitted(*each) for each in zip(designs, sampled, moments, strict=True)]
+
+    @classmethod
+    def _fitted(cls, design: Design, sample: tuple[Array, Array], moments: Moments) -> Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
-        whitening = Whitening.of(design)
-        moments = Moments.of(design, whitening)
+        whitening = moments.whitening
         weights, penalties = condition_weights(moments), design.settings.penalties
         others = moments.without(weights, penalties)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
@@ -320,6 +337,7 @@ class Readout:
         coefficients = np.array(list(moments.solved(weights, penalties)))[best, :, n].T
         return cls(
             design,
+            sample,
             whitening.directions @ coefficients * design.recordings.size,
             errors[:, best, n],
             moments.errors(coefficients),

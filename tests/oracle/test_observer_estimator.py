@@ -19,7 +19,7 @@ from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.reduction import reduced
-from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated
+from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated, samples
 
 
 def design(recordings, family="linear", settings=FEW):
@@ -62,8 +62,8 @@ def test_a_bank_is_its_system_and_blocks_are_sums_of_steps():
 def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     recordings, _ = plant(units=3, spread=0.1)
     made = design(recordings)
-    whitening = Whitening.of(made)
-    moments = Moments.of(made, whitening)
+    whitening = Whitening.of(made, samples([made])[0])
+    (moments,) = Moments.of([made], [whitening])
     penalty = 1e-6
     (found,) = moments.solved(np.ones(len(moments.groups)), [penalty])
     parts: dict = {}
@@ -90,13 +90,13 @@ def test_an_exact_plant_is_estimated_exactly(exact):
 
 def test_reduced_filters_are_stable_at_every_order_and_tend_to_the_bank():
     recordings, batches = plant(units=3, spread=0.2)
-    readout = Readout.of(design(recordings))
+    (readout,) = Readout.of([design(recordings)])
     batch = next(iter(batches.values()))
     v = readout.design.channels.signals(batch.states[:, 0, :1], batch.inputs[:, 0], {})
     wanted = readout.design.bank.rows(v, np.arange(len(v))) @ readout.coefficients
     apart = []
     for order in (1, 3, 6, 12):
-        filters = reduced(readout, order)
+        filters = reduced(readout, samples([readout.design.fine])[0], order)
         assert np.abs(np.linalg.eigvals(filters.A)).max() < 1
         z, estimates = filters.S @ v[0], []
         for row in v:
@@ -111,7 +111,7 @@ def test_a_reduction_keeps_its_digits_where_coefficients_cancel():
     recordings, batches = plant(units=3, spread=0.2)
     lifting = replace(LIFTING, functions=("2*position",))
     channels = channels_of(lifting, (0,), ("u",), "linear", {"position": (-3.0, 3.0), "u": (-3.0, 3.0)}, FEW)
-    readout = Readout.of(Design.of(channels, recordings, FEW))
+    (readout,) = Readout.of([Design.of(channels, recordings, FEW)])
     bank, errors = readout.design.bank, readout.typical * recordings.size
     batch = next(iter(batches.values()))
     v = channels.signals(batch.states[:, 0, :1], batch.inputs[:, 0], {})
@@ -119,7 +119,7 @@ def test_a_reduction_keeps_its_digits_where_coefficients_cancel():
     lag = len(channels) - 1 + bank.delayed * (len(bank.taps) - 2)
     large = readout.coefficients.copy()
     large[lag : lag + 2] += 1e10 * np.outer([2.0, -1.0], errors)
-    filters = reduced(replace(readout, coefficients=large))
+    filters = reduced(replace(readout, coefficients=large), samples([readout.design.fine])[0])
     z, estimates = filters.S @ v[0], []
     for row in v:
         estimates.append(filters.C @ z + filters.D @ row)
@@ -130,13 +130,13 @@ def test_a_reduction_keeps_its_digits_where_coefficients_cancel():
 def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     recordings, _ = plant(units=3, episodes=2, spread=0.3)
     settings = FEW.model_copy(update={"parts": 2, "rows": 100_000})
-    readout = Readout.of(design(recordings, settings=settings))
+    (readout,) = Readout.of([design(recordings, settings=settings)])
     key = recordings.keys[0]
     others = [k for k in recordings.keys if k.unit != key.unit and k.episode != key.episode]
     alone = replace(recordings, keys=tuple(others), lengths=recordings.lengths[: len(others)])
     made = design(alone, settings=settings)
-    whitening = Whitening.of(readout.design)
-    moments = Moments.of(made, whitening)
+    whitening = Whitening.of(readout.design, readout.sample)
+    (moments,) = Moments.of([made], [whitening])
     penalty = float(readout.penalties[1])
     (coefficients,) = moments.solved(np.ones(len(moments.groups)), [penalty])
     group = readout.design.groups[key]
@@ -152,13 +152,13 @@ def test_a_start_without_time_constants_of_its_own_is_that_of_the_lags(exact):
     recordings, _ = plant(units=3, spread=0.1)
     bank = design(recordings, settings=FEW.model_copy(update={"start": ()})).bank
     assert bank.starts == bank.lags
-    assert np.isfinite(Readout.of(design(recordings, settings=FEW.model_copy(update={"start": ()}))).typical).all()
+    assert np.isfinite(Readout.of([design(recordings, settings=FEW.model_copy(update={"start": ()}))])[0].typical).all()
 
 
 def test_few_episodes_of_the_regression_leave_no_group_without_moments():
     recordings, _ = plant(units=5, episodes=7, spread=0.1)
     settings = FEW.model_copy(update={"episodes": 4})
-    readout = Readout.of(design(recordings, settings=settings))
+    (readout,) = Readout.of([design(recordings, settings=settings)])
     assert set(readout.others) == set(readout.design.groups.values())
     assert readout.episode_errors().shape == (35, 3)
 
@@ -167,13 +167,13 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     recordings, batches = plant(units=3, spread=0.1)
     biased = replace(recordings, bias=np.array([0.5]))
     made = design(biased)
-    bank, X = made.bank, made.sample[0]
+    bank, X = made.bank, samples([made])[0][0]
     expected = np.zeros_like(X)
     of_y = np.flatnonzero(bank.channel == 0)
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (len(bank.taps) - 2))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = made.thinned(biased.bias)[0] - X
+    moved = samples([made], biased.bias)[0][0] - X
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):

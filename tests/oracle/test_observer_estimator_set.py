@@ -211,7 +211,7 @@ def test_functions_of_the_model_count_and_others_are_refused():
     assert np.any(estimate.B[:, 4])  # the sine, the fourth lifted state, behind one measurement and three states
     assert found.facts["outside_models_percent"] == dict.fromkeys(lifting.states, 0.0)
     design = found.readout.design
-    rows, weight = design.sample
+    rows, weight = found.readout.sample
     added = rows @ np.where(design.bank.channel[:, None] == 1, found.readout.coefficients, 0.0)  # the sine is channel 1
     shares, size = outside_percent(found.readout, LIFTING), design.recordings.size
     np.testing.assert_allclose(shares, 100 * np.sqrt(weight @ added**2) / size, rtol=1e-9)

@@ -162,14 +162,15 @@ def best_family(
     ends = (lifting.sizes_of(names) * recordings.ranges).T.tolist()
     known = [*measured, *range(n, len(names))]
     ranges = {names[i]: (ends[i][0], ends[i][1]) for i in known}
-    channels = [channels_of(lifting, measured, inputs, family, ranges, settings) for family in FAMILIES]
-    designs = [Design.of(c, recordings, settings) for c in (*channels, channels[0].without_measurements())]
-    *plain, blind = Readout.of([*designs[:-2], designs[-1]])
-    best, family, following = plain[0], FAMILIES[0], iter(plain[1:])
-    for name, design in zip(FAMILIES[1:], designs[1:-1], strict=True):
-        if len(design.bank) == len(best.design.bank):
-            break
-        richer = next(following, None) or Readout.of([design])[0]
+
+    def design(family: str) -> Design:
+        return Design.of(channels_of(lifting, measured, inputs, family, ranges, settings), recordings, settings)
+
+    plain = [design(family) for family in FAMILIES[:-1]]
+    *readouts, blind = Readout.of([*plain, Design.of(plain[0].channels.without_measurements(), recordings, settings)])
+    best, family, following = readouts[0], FAMILIES[0], iter(readouts[1:])
+    for name in FAMILIES[1:]:
+        richer = next(following, None) or Readout.of([design(name)])[0]
         if not is_less(richer.by_fold(hidden), best.by_fold(hidden), settings.margin):
             break
         best, family = richer, name

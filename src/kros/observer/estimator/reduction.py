@@ -83,11 +83,13 @@ def reduced(readout: Readout, fine: tuple[Array, Array], order: int | None = Non
     if order is not None:
         return whole.first(order)
     signals = design.signals(some=_EPISODES, length=round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
-    wanted, most = whole.along(signals), 2 * design.settings.loss
+    every, most = np.arange(len(signals)), 2 * design.settings.loss
+    wanted = np.stack([design.bank.rows(v, every) @ readout.coefficients for v in signals.swapaxes(0, 1)], axis=1)
 
     def enough(order: int) -> bool:
         missed = (whole.first(order).along(signals) - wanted)[..., used] / errors[used]
         return bool(np.mean(missed**2, axis=(0, 1)).max() <= most)
 
     # of errors that grow as little as asked, the least order
-    return whole.first(1 + bisect_left(range(1, len(sigma)), True, key=enough))
+    bound = next((n for n in 2 ** np.arange(len(sigma).bit_length()) if enough(n)), len(sigma))
+    return whole.first(bisect_left(range(bound), True, lo=1 + bound // 2, key=enough))

@@ -39,25 +39,22 @@ ASSUMPTIONS = (
 )
 
 
-def linear_estimate(
-    observer: ObserverData, modelled: Lifting, outside: Mapping[str, float] | None = None
-) -> tuple[StateSpace, Array]:
-    """Return the estimate of a model's lifted states from its (y, x, u), a strictly causal system, and its mean (n,).
+def linear_part(observer: ObserverData, modelled: Lifting) -> tuple[StateSpace, Array, list[str]]:
+    """Return the estimate of a model's lifted states from its (y, x, u), a strictly causal system, and what it misses.
 
-    Of x only functions of measured states are read, as the lifted states that models know them by. The mean is what the
-    constant channel leaves when everything else is at rest. `outside` is what `outside_percent` found, for the reason.
+    Of x only functions of measured states are read, as the lifted states that models know them by. It misses the mean
+    (n,), which the constant channel leaves when everything else is at rest, and the channels that models have no signal
+    for, which are named.
 
     Raises
     ------
     SynthesisError
-        When the estimate depends on channels that models have no signal for, or measurements arrive late.
+        When measurements arrive late.
     """
     assert observer.bank is not None
     own, n, q = observer.lifting, len(observer.recorded), len(observer.measured)
     if delay_of(observer.sensor):
-        raise SynthesisError(
-            "not certified for the set of plants: measurements arrive late, and the set contains no delay."
-        )
+        raise SynthesisError("measurements arrive late, and the set contains no delay.")
     size, first = n + observer.bank.filters, q + modelled.n_states
     weights = np.hstack([observer.A, observer.B])[:size]
     signals = _signals(modelled, observer.inputs)
@@ -70,17 +67,31 @@ def linear_estimate(
             constant = column
         elif column.any():
             unknown.append(text)
+    A = weights[:, :size].copy()
+    A[:, list(observer.measured)] = 0.0  # measurements stand there
+    C = np.eye(modelled.n_lifted, size) * (np.arange(modelled.n_lifted) < n)[:, None]
+    mean = C @ np.linalg.solve(np.eye(size) - A, constant)
+    return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])), observer.sample_period_s), mean, unknown
+
+
+def linear_estimate(
+    observer: ObserverData, modelled: Lifting, outside: Mapping[str, float] | None = None
+) -> tuple[StateSpace, Array]:
+    """Return `linear_part` with its mean, or say why a certificate for the set of plants cannot follow from it.
+
+    What channels without a signal contribute is `outside`, as `outside_percent` found it.
+    """
+    try:
+        system, mean, unknown = linear_part(observer, modelled)
+    except SynthesisError as error:
+        raise SynthesisError(f"not certified for the set of plants: {error}") from error
     if unknown:
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         shares = ", ".join(f"{name} {percent:.3g} %" for name, percent in (outside or {}).items() if percent)
         share = f"; the missing ones contribute, in percent of the range: {shares}" if shares else ""
         reason = f"the models have no signal {without_limits(unknown[0])}{more}{share}."
         raise SynthesisError(f"not certified for the set of plants: {reason}")
-    A = weights[:, :size].copy()
-    A[:, list(observer.measured)] = 0.0  # measurements stand there
-    C = np.eye(modelled.n_lifted, size) * (np.arange(modelled.n_lifted) < n)[:, None]
-    mean = C @ np.linalg.solve(np.eye(size) - A, constant)
-    return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])), observer.sample_period_s), mean
+    return system, mean
 
 
 def _signals(lifting: Lifting, inputs: Sequence[str]) -> list[str]:

@@ -91,5 +91,5 @@ def reduced(readout: Readout, fine: tuple[Array, Array], order: int | None = Non
         return bool(np.mean(missed**2, axis=(0, 1)).max() <= most)
 
     # of errors that grow as little as asked, the least order
-    bound = next((n for n in 2 ** np.arange(len(sigma).bit_length()) if enough(n)), len(sigma))
+    bound = next((n for n in (2**i for i in range(len(sigma).bit_length())) if enough(n)), len(sigma))
     return whole.first(bisect_left(range(bound), True, lo=1 + bound // 2, key=enough))

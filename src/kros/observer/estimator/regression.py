@@ -138,9 +138,7 @@ class Design:
         """Return the design with the bank of its channels."""
         return cls(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
 
-    def rows(
-        self, recordings: Recordings, rows: int, offset: Array | float = 0.0
-    ) -> Iterator[Rows]:
+    def rows(self, recordings: Recordings, rows: int, offset: Array | float = 0.0) -> Iterator[Rows]:
         """Yield episode, bank rows, targets and weights of every episode, with an offset of the measurements.
 
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
@@ -194,7 +192,9 @@ def samples(designs: Sequence[Design], offset: Array | float = 0.0) -> list[tupl
     recordings, settings = designs[0].recordings, designs[0].settings
     episodes = list(in_step(designs, recordings.some(settings.episodes // 2), settings.sample, offset))
     weights = np.concatenate([w for (*_, w), *_ in episodes])
-    return [(np.vstack([rows for _, rows, *_ in of_one]), weights / weights.sum()) for of_one in zip(*episodes)]
+    return [
+        (np.vstack([rows for _, rows, *_ in of_one]), weights / weights.sum()) for of_one in zip(*episodes, strict=True)
+    ]
 
 
 def interpolated(y: Array) -> Array:

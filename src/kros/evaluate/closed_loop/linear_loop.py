@@ -12,25 +12,23 @@ u = r + K x_hat <----+
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
-from small_gain import Blocks
 
-from kros.core.errors import DimensionError, SynthesisError
-from kros.core.lti import StateSpace, gain
-from kros.identify import ModelSet
-from kros.lifting import Lifting
-from kros.observer.data import ObserverData
-from kros.observer.estimator.channels import CONSTANT
-from kros.observer.sensor import delay_of
-from kros.synthesis import ObserverProblem
-from kros.synthesis.problem.interconnect import interconnect
-from kros.uncertainty import UncertainModel
+from ...core.arrays import frozen
+from ...core.errors import DimensionError, SynthesisError
+from ...core.lti import StateSpace, gain
+from ...identify import ModelSet
+from ...lifting import Lifting
+from ...observer.data import ObserverData
+from ...observer.estimator.certificate import linear_part
+from ...observer.sensor import delay_of
+from ...synthesis import ObserverProblem
+from ...synthesis.problem.interconnect import interconnect
+from ...uncertainty import UncertainModel
+from .small_gain import Blocks
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class LinearLoop:
     """Estimator and controller in scaled signals, around any model of a set, perturbed or not."""
 
@@ -105,7 +103,8 @@ def linear_estimator(observer: ObserverData, modelled: Lifting) -> tuple[StateSp
         When the observer corrects a model with other lifted states.
     """
     if observer.bank is not None:
-        return linear_part(observer, modelled)
+        system, _, unknown = linear_part(observer, modelled)
+        return system, unknown
     if observer.runtime.delay or delay_of(observer.sensor):
         raise SynthesisError("measurements arrive late, and the set contains no delay.")
     if observer.lifting.names != modelled.names:
@@ -122,30 +121,3 @@ def linear_estimator(observer: ObserverData, modelled: Lifting) -> tuple[StateSp
     if not F.is_stable():
         raise SynthesisError("the observer is not stable by itself.")
     return F, []
-
-
-def linear_part(observer: ObserverData, modelled: Lifting) -> tuple[StateSpace, list[str]]:
-    """Return the same of a filter bank, and the channels that models have no signal for."""
-    assert observer.bank is not None
-    own, n, q = observer.lifting, len(observer.recorded), len(observer.measured)
-    if delay_of(observer.sensor):
-        raise SynthesisError("measurements arrive late, and the set contains no delay.")
-    size, first = n + observer.bank.filters, q + modelled.n_states
-    weights = np.hstack([observer.A, observer.B])[:size]
-    signals = _signals(modelled, observer.inputs)
-    B, unknown = np.zeros((size, first + len(signals))), list[str]()
-    B[:, :q] = weights[:, list(observer.measured)]
-    for text, column in zip(_signals(own, observer.inputs), weights[:, own.n_states :].T, strict=True):
-        if text in signals:
-            B[:, first + signals.index(text)] = column
-        elif text != CONSTANT and column.any():
-            unknown.append(text)
-    A = weights[:, :size].copy()
-    A[:, list(observer.measured)] = 0.0  # measurements stand there
-    C = np.eye(modelled.n_lifted, size) * (np.arange(modelled.n_lifted) < n)[:, None]
-    return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])), observer.sample_period_s), unknown
-
-
-def _signals(lifting: Lifting, inputs: Sequence[str]) -> list[str]:
-    functions, of_inputs = ([f.text for f in formulas] for formulas in (lifting.formulas, lifting.input_formulas))
-    return [*functions, *inputs, *of_inputs]

@@ -17,22 +17,22 @@ Sources: J. C. Doyle, IEE Proceedings D 129 (1982) 242-250; A. Packard, M. K. H.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
-from kros.core.arrays import AnyArray as Array
-from kros.core.arrays import ArrayLike
-from kros.core.errors import SynthesisError
-from kros.core.lti import StateSpace
-from kros.core.norms import balanced, crossings, first_frequencies, to_continuous
-from kros.core.rounding import ITERATED, TINY
+from ...core.arrays import AnyArray as Array
+from ...core.arrays import ArrayLike, frozen
+from ...core.errors import SynthesisError
+from ...core.lti import StateSpace
+from ...core.norms import balanced, crossings, first_frequencies, to_continuous
+from ...core.rounding import ITERATED, TINY
 
 _STEPS = 60  # of iterations that end much earlier
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class Blocks:
     """A stable discrete system between the blocks of a perturbation; `sizes` are signals (w_i, z_i) of every block."""
 
@@ -90,7 +90,7 @@ class Blocks:
         return None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen
 class StructuredPeak:
     """The largest mu: at most `upper`, at least `lower`, at which ``Delta / lower`` has the loop at its limit."""
 

@@ -12,16 +12,15 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from controller import Controller
-from linear_loop import LinearLoop
-from simulated_loop import DEFAULT, diverging
-from small_gain import peak, worst_gain
-
-from kros.core.errors import SynthesisError
-from kros.core.norms import hinf_norm
-from kros.data import EpisodeBatch
-from kros.observer import Observer
-from kros.uncertainty.quantify import UncertainModels
+from ...core.errors import SynthesisError
+from ...core.norms import hinf_norm
+from ...data import EpisodeBatch
+from ...observer import Observer
+from ...uncertainty.quantify import UncertainModels
+from .controller import Controller
+from .linear_loop import LinearLoop
+from .simulated_loop import DEFAULT, diverging
+from .small_gain import peak, worst_gain
 
 ASSUMPTIONS = (
     "for margin, gain and spectral radius the loop is linear: functions are those of the plant, nothing saturates",
@@ -82,14 +81,14 @@ class LoopResult:
         return [*lines, *(f"  assumed: {text}" for text in self.assumptions)]
 
 
-def close_loop(observer: Observer, found: UncertainModels, controller: Any, samples: int = 5000) -> LoopResult:
+def close_loop(observer: Observer, uncertain: UncertainModels, controller: Any, samples: int = 5000) -> LoopResult:
     """Judge the loop of a controller that uses an observer's estimates, on all units and on the uncertain set.
 
     Parameters
     ----------
     observer : Observer
         As it is deployed; its name says which kind of model it belongs to, the first one otherwise.
-    found : UncertainModels
+    uncertain : UncertainModels
         Models of all units and the set around them, as `kros.quantify` returns them.
     controller : Controller or control.StateSpace
         From estimated states to inputs, by name, in the units of the recordings.
@@ -109,26 +108,25 @@ def close_loop(observer: Observer, found: UncertainModels, controller: Any, samp
     """
     controller = controller if isinstance(controller, Controller) else Controller.from_system(controller)
     kind = observer.name.partition("/")[0]
-    kind = kind if kind in found.sets else next(iter(found.sets))
-    models, uncertain, facts = found.models.models(kind), found.sets[kind], found.models.facts
-    units = uncertain.unit_ids
-    first = [facts.keys("test", unit, models.condition)[0] for unit in units]
-    batch = EpisodeBatch.read(found.models.population, first, samples)
+    kind = kind if kind in uncertain.sets else next(iter(uncertain.sets))
+    models, covered, facts = uncertain.models.models(kind), uncertain.sets[kind], uncertain.models.facts
+    first = [facts.keys("test", unit, models.condition)[0] for unit in covered.unit_ids]
+    batch = EpisodeBatch.read(uncertain.models.population, first, samples)
     diverged = diverging(observer, models, batch, controller)
     reasons, known = list[str](), dict[str, Any](diverged=diverged)
     if diverged:
         reasons.append(f"it diverges in simulation with {', '.join(diverged)}")
     try:
-        loop, left_out = LinearLoop.of(observer, models, uncertain, controller.placed(observer, models))
+        loop, left_out = LinearLoop.of(observer, models, covered, controller.placed(observer, models))
     except SynthesisError as error:
         reasons.append(f"there is no linear analysis: {error}")
         return LoopResult(LoopStatus.NOT_SAFE if diverged else LoopStatus.UNDECIDED, tuple(reasons), **known)
     if left_out:
         known["assumptions"] = (*ASSUMPTIONS, f"the linear estimator does without {', '.join(left_out)}")
-    known["spectral_radius"] = {unit: loop.unit(unit).largest_pole() for unit in units}
+    known["spectral_radius"] = {unit: loop.unit(unit).largest_pole() for unit in covered.unit_ids}
     if unstable := [unit for unit, radius in known["spectral_radius"].items() if radius >= 1]:
         reasons.append(f"it is unstable with {', '.join(unstable)}")
-    known |= bounds(loop, uncertain.nominal_id)
+    known |= bounds(loop, covered.nominal_id)
     if known["destabilising"] <= 1:
         reasons.append("it is unstable with a member of the set")
     if reasons:
@@ -137,7 +135,7 @@ def close_loop(observer: Observer, found: UncertainModels, controller: Any, samp
 
 
 def bounds(loop: LinearLoop, nominal: str) -> dict[str, float]:
-    """Return margin, what destabilises, and gains; nothing but zeros where the nominal loop is not stable."""
+    """Return margin, what destabilises, and gains; where the nominal loop is not stable, that nothing is needed."""
     blocks = loop.blocks()
     if not blocks.system.is_stable():
         return {"destabilising": 0.0}

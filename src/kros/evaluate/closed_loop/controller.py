@@ -8,14 +8,14 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field
 
-from kros.core.errors import ConfigError
-from kros.core.files import did_you_mean
-from kros.core.lti import StateSpace, gain, real_array
-from kros.core.rounding import AGREED
-from kros.core.settings import Settings
-from kros.identify import ModelSet
-from kros.observer.data import ObserverData
-from kros.observer.units import recorded_factors
+from ...core.errors import ConfigError
+from ...core.files import did_you_mean
+from ...core.lti import StateSpace, gain, real_array
+from ...core.rounding import AGREED
+from ...core.settings import Settings
+from ...identify import ModelSet
+from ...observer.data import ObserverData
+from ...observer.units import recorded_factors
 
 Rows = tuple[tuple[float, ...], ...]
 

@@ -60,7 +60,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "one recovery": {"recoveries": (3.0,)},
     "reach = 10": {"reach": 10.0},
     "room = 10": {"room": 10.0},
-    "gap_samples = 5000": {"gap_samples": 5000},
+    "gap_samples = 60000": {"gap_samples": 60_000},
     "rows = 20000": {"rows": 20_000},
     "sample = 3000": {"sample": 3000},
 }

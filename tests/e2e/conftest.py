@@ -17,7 +17,7 @@ from kros.report.figures import Drawn, draw
 from kros.report.run_folder import RunFolder
 
 # An estimator that learns from less: the keys of [estimator].
-QUICK = "rows = 6000\nsample = 2000\nfolds = 2\nparts = 2\ngap_episodes = 4\ngap_samples = 3000\npenalties = [1e-12, 1e-8, 1e-4]\n"
+QUICK = "rows = 6000\nsample = 2000\nfolds = 2\nparts = 2\ngap_episodes = 4\ngap_samples = 12000\npenalties = [1e-12, 1e-8, 1e-4]\n"
 
 
 @pytest.fixture(scope="session")

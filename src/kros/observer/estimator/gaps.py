@@ -23,10 +23,10 @@ def training(
     recordings: Recordings, at: Sequence[int], settings: EstimatorSettings
 ) -> tuple[Array, Array, Array, dict[str, Array]]:
     """Return states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
-    some = recordings.some(settings.gap_episodes)
-    length = min(min(some.lengths), settings.gap_samples)
-    batches = [recordings.read(key).head(length) for key in some.keys]
-    again = np.arange(settings.gap_episodes) % len(batches)  # every episode is seen with several losses
+    length = min(min(recordings.lengths), settings.gap_samples // settings.gap_episodes)
+    count = settings.gap_samples // length
+    batches = [recordings.read(key).head(length) for key in recordings.some(count).keys]
+    again = np.arange(count) % len(batches)  # every episode is seen with several losses
     signals = (
         [b.states for b in batches],
         [b.measurements(at, arrived=False) for b in batches],

@@ -93,9 +93,11 @@ class EstimatorSettings(Settings):
         description="share of its range by which a missing measurement may differ from the fallback",
     )
     gap_samples: int = Field(
-        20_000, ge=100, description="samples of an episode on which losses are simulated in training"
+        240_000, ge=100, description="samples on which losses are simulated in training, over all episodes"
     )
-    gap_episodes: int = Field(12, ge=1, description="episodes, and patterns of losses that are simulated on them")
+    gap_episodes: int = Field(
+        12, ge=1, description="patterns of losses that are simulated on them, at least; more on short episodes"
+    )
     seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")
 
     def lags(self, length: float) -> tuple[float, ...]:

@@ -237,7 +237,7 @@ def test_a_controller_over_the_demo_is_judged(demo, tmp_path, monkeypatch, capsy
     main, file = import_module("run").main, tmp_path / "controller.json"
     content = {"D": [[gain]], "sample_period_s": 0.001, "inputs": ["velocity"], "outputs": ["target_velocity"]}
     file.write_text(json.dumps(content))
-    command = [str(demo), "--controller", str(file), "--observer", "koopman_edmd/mixed"]
+    command = [str(demo), "--controller", str(file), "--observer", "koopman/worst_case_h2"]
     assert main([*command, "--json"]) == code
     said = json.loads(capsys.readouterr().out)
     assert said["status"] == word

@@ -85,8 +85,8 @@ def synthesize(
         Of `kros.quantify`.
     method : str or Method, optional
         A method such as ``worst_case_h2``, for the first kind of model that it is for, or a name such as
-        ``linear/worst_case_h2``, or a method of `kros.design.methods` with other options. Default: all are tried, and the
-        most accurate one on training episodes that is certified and tolerates dropouts is returned.
+        ``linear/worst_case_h2``, or a method of `kros.design.methods` with other options. Default: all are tried, and
+        the most accurate one on training episodes that is certified and tolerates dropouts is returned.
     observer, estimator : mapping, optional
         As ``[observer]`` and ``[estimator]`` of a study.
     sensor : mapping of str to mapping, optional

@@ -179,10 +179,8 @@ class Fold:
             population.select([u for u in population.unit_ids if u not in self.held]), lifting, test=self.test
         )
         self.seconds["identify"] = time.process_time() - began
-        found = kros.quantify(models)
+        self.uncertain: UncertainModels = kros.quantify(models)
         self.seconds["quantify"] = time.process_time() - began - self.seconds["identify"]
-        refined = tuple(kind for kind in models.kinds if not kind.endswith("edmd"))
-        self.uncertain: UncertainModels = replace(found, models=replace(models, kinds=refined))
         self.population = population.select(self.held)
         self._designs: Designs | None = None
 
@@ -196,11 +194,10 @@ class Fold:
     def design(self, sensor: Mapping[str, Sensor]) -> Designs:
         """Design all observers for a sensor."""
         began = time.process_time()
-        methods = tuple(m for m in SynthesisSettings().methods if m != "mixed")
         baselines = ObserverSettings(baselines=("open_loop", "kalman_tuned"))
         found = synthesize_all(
             self.uncertain,
-            SynthesisSettings(methods=methods),
+            SynthesisSettings(),
             baselines,
             EstimatorSettings(),
             sensor=sensor,
@@ -211,7 +208,7 @@ class Fold:
     def learned(self, sensor: Mapping[str, Sensor]) -> Any:
         """Train the learned estimator for a sensor."""
         models = self.uncertain.models
-        first = models.models(models.kinds[0])
+        first = models.models()
         return make_learned(TrainingSet.whole(models, first, sensor), first.measured)
 
     def batch(self, sensor: Mapping[str, Sensor]) -> EpisodeBatch:

@@ -63,7 +63,8 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
 
 def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
     """Return errors, ratios and weights of one study."""
-    sets = {name: context.identified.models(name) for name in context.identified.kinds}
+    identified = context.identified
+    sets = {name: identified.models(name) for name in identified.kinds + identified.edmd_kinds}
     errors = {name: percent(context, models) for name, models in sets.items()}
     middle = {name: np.median(e, axis=0) for name, e in errors.items()}
     found: dict[str, Any] = {

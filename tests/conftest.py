@@ -43,7 +43,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if unknown := {
         item.path.name
         for item in items
-        if "demo" in getattr(item, "fixturenames", ()) and groups[item.nodeid] != "demo"
+        if {"demo", "paper"} & set(getattr(item, "fixturenames", ())) and groups[item.nodeid] != "demo"
     }:
         raise pytest.UsageError(
             f"tests/conftest.py, DEMO: should name {', '.join(sorted(unknown))}, which needs the demo's study."

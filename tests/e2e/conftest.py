@@ -52,6 +52,19 @@ def demo(kros, recorded, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def paper(kros, recorded, tmp_path_factory) -> Path:
+    """A study of the same recordings with the paper's models and observers."""
+    folder = tmp_path_factory.mktemp("paper")
+    few = '[synthesis]\nmethods = ["mixed", "paper"]\n[observer]\nbaselines = ["open_loop"]\n[uncertainty]\nn_freqs = 300\n'
+    (folder / "paper.toml").write_text(
+        f'[data]\nsource = "{recorded}"\nreader = "parquet"\n[identify]\nrefine = false\n{few}'
+    )
+    result = kros("run", folder / "paper.toml", "--out", folder / "run", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    return folder / "run"
+
+
+@pytest.fixture(scope="session")
 def metrics(demo) -> dict[str, Any]:
     """The demo's machine-readable result."""
     return json.loads((demo / "metrics.json").read_text())

@@ -40,9 +40,9 @@ def test_metrics_keep_the_contract(metrics):
     assert all(
         u["status"] == "ok" and 0.9 < u["concentration"] <= 1 for u in metrics["units"] if u["group"] != "outliers"
     )
-    assert list(metrics["models"]) == ["koopman", "linear", "koopman_edmd", "linear_edmd"]
+    assert list(metrics["models"]) == ["koopman", "linear"]
     for name, model in metrics["models"].items():
-        assert model["order"] == {"koopman": 4, "linear": 3}[name.removesuffix("_edmd")]
+        assert model["order"] == {"koopman": 4, "linear": 3}[name]
         assert model["spectral_radius_max"] < 1
         assert set(model["freerun_error_percent"]) == CHANNELS
         assert all(0 < e["median"] <= e["worst"] < 60 for e in model["freerun_error_percent"].values())
@@ -184,7 +184,7 @@ def test_new_units_are_scored(kros, demo, recorded, tmp_path):
         (tmp_path / "elsewhere").rename(recorded)
 
 
-@pytest.mark.parametrize("name", ["koopman_edmd", "linear_edmd"])
+@pytest.mark.parametrize("name", ["koopman", "linear"])
 def test_noise_is_kept_and_summarised(demo, metrics, name):
     share = metrics["uncertainty"][name]["noise_share"]
     assert all(0 <= share[key] <= 1 for key in ("median", "at_peak"))

@@ -70,7 +70,7 @@ def test_a_drive_that_was_left_out_is_estimated_as_well_as_by_a_regression(examp
             "pneumatic",
             ["--until", "identify"],
             (9, 0.02),
-            {"koopman": 3, "linear": 2, "koopman_edmd": 3, "linear_edmd": 2},
+            {"koopman": 3, "linear": 2},
         ),
     ],
 )

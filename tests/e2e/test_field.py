@@ -235,7 +235,7 @@ def test_a_controller_over_the_demo_is_judged(kros, demo, tmp_path, gain, code, 
     file = tmp_path / "controller.json"
     content = {"D": [[gain]], "sample_period_s": 0.001, "inputs": ["velocity"], "outputs": ["target_velocity"]}
     file.write_text(json.dumps(content))
-    command = ["loop", demo, "--controller", file, "--observer", "koopman_edmd/mixed"]
+    command = ["loop", demo, "--controller", file, "--observer", "koopman/worst_case_h2"]
     result = kros(*command, "--json")
     assert result.exit_code == code
     said = json.loads(result.stdout)

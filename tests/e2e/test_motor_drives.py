@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -28,7 +29,8 @@ def test_settings_are_the_published_ones():
     assert (study.uncertainty.form, study.data.reader) == ("inverse_input_multiplicative", "motor-drive-raw")
 
 
-def test_claims_are_those_of_the_run(claims, metrics):
+def test_claims_are_those_of_the_run(claims, paper):
+    metrics = json.loads((paper / "metrics.json").read_text())
     found = list(claims.claims(metrics))
     assert all(section and claim and answer for section, claim, answer in found)
     assert [len(row.split(" | ")) for row in claims.table(metrics).splitlines()] == [3] * (len(found) + 2)

@@ -38,7 +38,7 @@ from kros.synthesis.result import Injection, Status, Synthesis
 from kros.uncertainty import Form
 from kros.uncertainty.quantify import residuals_beside_weights
 
-HOSTILE, LOST = "0<b>4", "linear_edmd/mixed"
+HOSTILE, LOST = "0<b>4", "linear/worst_case_h2"
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def page(demo, metrics, tmp_path_factory) -> str:
     changed = json.loads(json.dumps(metrics).replace(f'"unit": "{unit}"', f'"unit": "{HOSTILE}"'))
     for row in changed["evaluation"]:
         row["error_percent"] = None if row["observer"] == LOST else row["error_percent"]
-    changed["observers"]["linear_edmd/hinf"] = {"status": "failed", "reason": "a reason; a reason; another"}
+    changed["observers"]["linear/hinf"] = {"status": "failed", "reason": "a reason; a reason; another"}
     out = tmp_path_factory.mktemp("page") / "report.html"
     return render(demo, changed, out=out).read_text(encoding="utf-8")
 
@@ -207,8 +207,17 @@ def test_figures_as_files_are_the_same_every_time(demo, tmp_path, monkeypatch) -
         write_figures(demo, tmp_path / "new" / "a" / names[0])
 
 
-def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(run) -> None:
-    pair = ["linear_edmd/mixed", "koopman_edmd/mixed"]
+def test_observers_of_the_paper_are_named_so_and_belong_to_its_models(run, paper) -> None:
+    assert "identify.refine = false" in draw("observers_in_time_paper", run).reason
+    assert "as published" not in (run.folder / "report.html").read_text(encoding="utf-8")
+    page = (paper / "report.html").read_text(encoding="utf-8")
+    assert "as published" in page
+    assert "Koopman (EDMD), mixed, entrywise weights" in page
+    assert "Refined models" not in page
+
+
+def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(paper) -> None:
+    pair, run = ["linear_edmd/paper", "koopman_edmd/paper"], RunFolder(paper)
     rows = np.reshape(draw("observers_in_time_paper", run).figure.axes, (6, 4))
     titles = [axes.get_title("left").partition(":")[0] for axes in rows[::3, 0]]
     assert titles == ["nominal", "worst off-nominal"]
@@ -232,7 +241,7 @@ def test_magnitude_and_phase_of_all_units(run) -> None:
 
 
 def test_output_forms_of_the_paper_never_fall_below_one_and_entries_have_names(run) -> None:
-    model, models = run.uncertain["koopman_edmd"], run.models["koopman_edmd"]
+    model, models = run.uncertain["koopman"], run.models["koopman"]
     bounds = published_bounds(model, models)
     assert set(bounds) == {Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE}
     assert all(np.all(bound > 1 - 1e-9) for _, bound in bounds.values())
@@ -241,7 +250,7 @@ def test_output_forms_of_the_paper_never_fall_below_one_and_entries_have_names(r
 
 
 def test_filter_is_scaled_by_the_ranges(run) -> None:
-    models = run.models["linear_edmd"]
+    models = run.models["linear"]
     K = StateSpace([[0.5]], [[1.0]], [[1.0], [2.0]], [[0.0], [0.0]], run.sample_period_s)
     scaled = scaled_filter(Synthesis("mixed", K, Status.OPTIMAL, Injection.INPUT), models)
     # innovation of the measurement's range over the pole at one half, correction over the inputs' ranges

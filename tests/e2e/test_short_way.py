@@ -34,11 +34,11 @@ ROLES = {
 STATE = 'role = "state"'
 # Methods that take long for one kind of models each: what chooses among them is the same.
 FEWER: dict[str, Any] = {
-    "design.synthesize.suitable": lambda methods, kind, kinds: [
-        m for m in suitable(methods, kind, kinds) if ONCE.get(m.name, kind) == kind
+    "design.synthesize.suitable": lambda methods, kind: [
+        m for m in suitable(methods, kind) if ONCE.get(m.name, kind) == kind
     ],
 }
-ONCE = {"estimator": "koopman", "worst_case_h2": "linear", "mixed": "koopman_edmd", "residual_h2": "koopman_edmd"}
+ONCE = {"estimator": "koopman", "worst_case_h2": "linear", "residual_h2": "koopman"}
 LIFTING = "sin(100*position + phase)"
 README_LIFTING = "sin(position)"
 

@@ -6,11 +6,9 @@ from kros.design.methods import METHODS, methods_of, preferred, suitable
 from kros.design.settings import BASELINES
 from kros.design.settings import METHODS as NAMES
 
-BOTH = ("linear", "linear_edmd")
 
-
-def names(wanted, kind, kinds):
-    return [method.name for method in suitable(methods_of(wanted), kind, kinds)]
+def names(wanted, kind):
+    return [method.name for method in suitable(methods_of(wanted), kind)]
 
 
 def test_every_name_of_a_study_has_a_method():
@@ -21,19 +19,15 @@ def test_every_name_of_a_study_has_a_method():
 
 def test_what_does_not_suit_refined_models_is_left_out_with_the_reason(caplog):
     caplog.set_level(logging.INFO, logger="kros.design.methods")
-    wanted = ("mixed", "worst_case_h2", "open_loop", "filtered_difference")
-    assert names(wanted, "koopman_edmd", ("koopman_edmd",)) == ["open_loop", "mixed", "worst_case_h2"]
+    wanted = ("mixed", "paper", "worst_case_h2", "open_loop", "filtered_difference")
+    assert names(wanted, "koopman_edmd") == ["open_loop", "paper", "mixed", "worst_case_h2"]
     assert not caplog.records
-    assert names(wanted, "koopman", ("koopman",)) == ["open_loop", "worst_case_h2"]
-    assert "koopman/mixed is not designed: the paper's problem" in caplog.text
-    two = ["residual_h2", "estimator"]
-    assert names(two, "linear", BOTH) == two
-    assert names(two, "linear_edmd", BOTH) == ["residual_h2"]
-    assert names(two, "linear_edmd", ("linear_edmd",)) == two
-    assert "linear_edmd/estimator is not designed: it is fitted to recordings" in caplog.text
+    assert names(wanted, "koopman") == ["open_loop", "worst_case_h2"]
+    for method in ("mixed", "paper"):
+        assert f"koopman/{method} is not designed: it is for the paper's models; set identify.refine" in caplog.text
 
 
 def test_the_best_guarantee_is_deployed():
-    made = ["koopman/open_loop", "koopman/residual_h2", "koopman_edmd/worst_case_h2", "linear/worst_case_h2"]
-    assert preferred(made) == "koopman_edmd/worst_case_h2"
+    made = ["koopman/open_loop", "koopman/residual_h2", "koopman/worst_case_h2", "linear/worst_case_h2"]
+    assert preferred(made) == "koopman/worst_case_h2"
     assert preferred(["koopman/ekf"]) is None

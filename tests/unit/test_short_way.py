@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def test_from_arrays_to_a_step(uncertain: UncertainModels, population: Populatio
 class Refusing(OpenLoop):
     """A method that is for no kind of model."""
 
-    def refusal(self, kind: str, kinds: Collection[str]) -> str:
+    def refusal(self, kind: str) -> str:
         return "it never is"
 
 

@@ -85,8 +85,8 @@ def synthesize(
         Of `kros.quantify`.
     method : str or Method, optional
         A method such as ``worst_case_h2``, for the first kind of model that it is for, or a name such as
-        ``koopman_edmd/mixed``, or a method of `kros.design.methods` with other options. Default: all are tried, and the
-        most accurate one on training episodes that is certified and tolerates dropouts is returned.
+        ``linear/worst_case_h2``, or a method of `kros.design.methods` with other options. Default: all are tried, and
+        the most accurate one on training episodes that is certified and tolerates dropouts is returned.
     observer, estimator : mapping, optional
         As ``[observer]`` and ``[estimator]`` of a study.
     sensor : mapping of str to mapping, optional
@@ -165,9 +165,8 @@ def synthesize_all(
 
 def _named(uncertain: UncertainModels, method: str | Method, estimator: EstimatorSettings) -> tuple[str, Method]:
     """Return a method and the kind of model that it is named with, or the first one that it is for."""
-    kinds = uncertain.models.kinds
     methods = methods_of([m.name for m in METHODS], estimator) + ([] if isinstance(method, str) else [method])
-    pairs = [(kind, m) for kind in kinds for m in suitable(methods, kind, kinds)]
+    pairs = [(kind, m) for kind in uncertain.models.kinds for m in suitable(methods, kind)]
     for kind, m in pairs:
         if method in (m, m.name, f"{kind}/{m.name}"):
             return kind, m
@@ -196,7 +195,7 @@ def tasks_of(
         recordings=TrainingSet.whole(identified, recorded, sensor).normalised(recorded),
         covered=covered.unit_ids,
     )
-    return [task(f"{kind}/{m.name}", m) for m in suitable(methods, kind, identified.kinds)]
+    return [task(f"{kind}/{m.name}", m) for m in suitable(methods, kind)]
 
 
 def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Sensors) -> Array:

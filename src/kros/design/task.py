@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,7 +15,6 @@ from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import SynthesisError
 from ..core.lti import gain
 from ..identify import ModelSet
-from ..identify.model_set import kind_of
 from ..observer import Observer, ReliftCertificate, Runtime
 from ..observer.sensor import Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
@@ -28,12 +27,10 @@ class Method(ABC):
 
     name: ClassVar[str]
     assumes_disturbances: ClassVar[bool] = False  # chooses those that all observers of its models are certified for
-    fits_recordings: ClassVar[bool] = False  # and not models: those of EDMD and refined ones give the same observer
 
-    def refusal(self, kind: str, kinds: Collection[str]) -> str:
-        """Return why the method is not used for one of some kinds of models; empty where it is."""
-        again = self.fits_recordings and not kind_of(kind).refined and kind.removesuffix("_edmd") in kinds
-        return "it is fitted to recordings, not to models, and is designed for refined models" if again else ""
+    def refusal(self, kind: str) -> str:
+        """Return why the method is not used for a kind of model; empty where it is."""
+        return ""
 
     @abstractmethod
     def design(self, task: DesignTask) -> Design:

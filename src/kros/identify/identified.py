@@ -18,7 +18,7 @@ from ..data.population import Population
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor
-from .model_set import KINDS, ModelSet, kinds_for
+from .model_set import ModelSet, kinds_for
 from .survey import RecordingFacts
 
 T = TypeVar("T")
@@ -85,8 +85,8 @@ class IdentifiedModels:
     facts: RecordingFacts  # of the recordings, with the split into training and test
     lifting: Lifting  # of the Koopman models
     calibration: PhaseCalibration | None = None  # of the lifting's parameter, where it has one
-    kinds: tuple[str, ...] = ()  # of models; the one that others follow comes first
-    sets: Mapping[str, ModelSet] = field(default_factory=dict)  # by `place`
+    kinds: tuple[str, ...] = ()  # of models: refined ones, or those of EDMD; the one that others follow comes first
+    sets: Mapping[str, ModelSet] = field(default_factory=dict)  # by `place`; refined ones beside their start
     factors: Mapping[str, EpisodeFactors] = field(default_factory=dict)  # by condition
 
     def __repr__(self) -> str:
@@ -95,8 +95,8 @@ class IdentifiedModels:
 
     @property
     def edmd_kinds(self) -> tuple[str, ...]:
-        """The paper's kinds of models, identified in every condition; the first one scores outliers."""
-        return tuple(kind.name for kind in kinds_for(self.lifting, refined=False))
+        """The paper's kinds of models, in the order of `kinds`, in every condition; the first one scores outliers."""
+        return tuple(kinds_for(self.lifting, refined=False))
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -167,7 +167,7 @@ class IdentifiedModels:
         sets = Stored(ModelSet.load, {place: folder / "models" / place for place in content["sets"]})
         places = {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]}
         factors = Stored(EpisodeFactors.load, places)
-        lifting = next(sets[kind.name].lifting for kind in KINDS if kind.name in sets)
+        lifting = sets[content["kinds"][0]].lifting
         calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None
         return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors)
 

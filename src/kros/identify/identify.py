@@ -2,7 +2,8 @@
 
 recordings --survey--> training episodes --calibrate--> parameters of the lifting
 training episodes --one pass--> factors --EDMD, one regularisation for all--> koopman_edmd, linear_edmd in every
-condition in the condition that feeds synthesis --refined on free-run error--> koopman, linear
+condition
+those of the condition that feeds synthesis --refined on free-run error--> koopman, linear, in their place
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
 from .factors import Factor, Ranges, combine, lifted_factor, reduce_episode, require_excitation
 from .identified import EpisodeFactors, IdentifiedModels
-from .model_set import ModelKind, ModelSet, kinds_for
+from .model_set import ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .refine import RefineOptions, refine_population
 from .refine.metric import peak_residual
@@ -111,8 +112,8 @@ def with_models(base: IdentifiedModels, settings: IdentifySettings, work: Work) 
     for condition, (recorded, models, refining) in begun.items():
         factors[condition] = recorded
         sets |= {base.place(m.name, condition): m for m in (*models, *refining())}
-    refined_kinds = tuple(kind.name for kind in kinds_for(base.lifting, refined=True)) if settings.refine else ()
-    return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors)
+    kinds = kinds_for(base.lifting, refined=settings.refine)
+    return replace(base, kinds=tuple(kinds), sets=sets, factors=factors)
 
 
 def _check_conditions(base: IdentifiedModels) -> None:
@@ -192,7 +193,7 @@ class _Reduced:
 
     def identify(self, settings: IdentifySettings) -> list[ModelSet]:
         """Identify every kind of model with one common regularisation."""
-        sets = [self._unfitted(kind) for kind in kinds_for(self.base.lifting, refined=False)]
+        sets = [self._unfitted(*kind) for kind in kinds_for(self.base.lifting, refined=False).items()]
         factors = [self.lifted(m.lifting) for m in sets]
         alpha = self._search(sets, factors, settings) if settings.alpha == "auto" else float(settings.alpha)
         require_excitation(self.factor, self.base.population.inputs, self.units, self.condition, alpha)
@@ -202,12 +203,12 @@ class _Reduced:
             require_stable(m, self.pooled)
         return models
 
-    def _unfitted(self, kind: ModelKind) -> ModelSet:
-        lifting, population = kind.lifting(self.base.lifting), self.base.population
+    def _unfitted(self, kind: str, lifting: Lifting) -> ModelSet:
+        population = self.base.population
         rows = self.pooled if self.pooled.any() else slice(None)
         ranges, nothing = Ranges.of(self.lifted(lifting), lifting.n_lifted, rows), np.zeros((len(self.units), 0, 0))
         return ModelSet(
-            name=kind.name,
+            name=kind,
             condition=self.condition,
             lifting=lifting,
             channels=population.channels,
@@ -248,7 +249,7 @@ class _Reduced:
 
         def refining() -> list[ModelSet]:
             of = zip(kinds_for(base.lifting, refined=True), starts, results(), strict=True)
-            return [replace(start, name=kind.name, A=m.A, B=m.B) for kind, start, m in of]
+            return [replace(start, name=kind, A=m.A, B=m.B) for kind, start, m in of]
 
         return refining
 

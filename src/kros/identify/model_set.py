@@ -11,13 +11,14 @@ import numpy as np
 
 from ..core.arrays import AnyArray, Array, ArrayLike
 from ..core.artifacts import Storable, divided, load_artifact, loader, save_artifact, united
-from ..core.errors import ConfigError
 from ..core.frequency import log_grid
 from ..core.lti import StateSpace
 from ..data.population import Channel, Role
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
 from .factors import Ranges
+
+EDMD = "_edmd"  # at the end of the paper's kinds of models
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -154,36 +155,8 @@ class ModelSet(Storable):
         return self.ranges.normalise(KoopmanMatrices(self.A, self.B)).spectral_radius()
 
 
-@dataclass(frozen=True)
-class ModelKind:
-    """One kind of model: with lifted functions or without, refined on free-run error or not."""
-
-    name: str
-    lifted: bool
-    refined: bool
-
-    def lifting(self, lifting: Lifting) -> Lifting:
-        """Return the lifting of this kind."""
-        return lifting if self.lifted else Lifting(lifting.states)
-
-
-KINDS = (
-    ModelKind("koopman", lifted=True, refined=True),
-    ModelKind("linear", lifted=False, refined=True),
-    ModelKind("koopman_edmd", lifted=True, refined=False),
-    ModelKind("linear_edmd", lifted=False, refined=False),
-)
-
-
-def kind_of(name: str) -> ModelKind:
-    """Return a kind by its name."""
-    kinds = {kind.name: kind for kind in KINDS}
-    if name not in kinds:
-        raise ConfigError(f"Kind of model {name!r}: is unknown; known are {', '.join(kinds)}.")
-    return kinds[name]
-
-
-def kinds_for(lifting: Lifting, *, refined: bool) -> tuple[ModelKind, ...]:
-    """Return the kinds of models, refined or by EDMD, of a lifting: without functions the linear one alone."""
-    has_functions = bool(lifting.functions + lifting.input_functions)
-    return tuple(kind for kind in KINDS if kind.refined == refined and (has_functions or not kind.lifted))
+def kinds_for(lifting: Lifting, *, refined: bool) -> dict[str, Lifting]:
+    """Return the lifting of every kind of models, refined or by EDMD: without functions the linear one alone."""
+    has_functions, ending = bool(lifting.functions + lifting.input_functions), "" if refined else EDMD
+    lifted = {f"koopman{ending}": lifting} if has_functions else {}
+    return lifted | {f"linear{ending}": Lifting(lifting.states)}

@@ -47,16 +47,16 @@ class IdentifySettings(Settings):
 
     At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the
     population is finite; the factor is doubled until the peak residual around the best nominal unit is at most one
-    half, where that can be reached. `refine` adds models that are refined on their free-run error, the population
-    first, then each unit, held near the population's model by a prior that is never so weak that the peak residual
-    exceeds one half.
+    half, where that can be reached. `refine` replaces these models by ones that are refined on their free-run error,
+    the population first, then each unit, held near the population's model by a prior that is never so weak that the
+    peak residual exceeds one half.
     """
 
     alpha: float | Literal["auto"] = Field(
         "auto",
         description="regularisation of channels divided by their ranges; a number: of recorded units, as in the paper",
     )
-    refine: bool = Field(True, description="models refined on their free-run error, beside those of the paper's recipe")
+    refine: bool = Field(True, description="models refined on their free-run error, in place of those of the paper")
 
     @field_validator("alpha")
     @classmethod

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import floor, isfinite, log10
+from typing import TypeVar
 
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
 from .theme import Tone
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,8 @@ def words(name: str) -> str:
 
 def model_label(name: str) -> str:
     """Return what a model is called, for example ``Koopman (EDMD)``."""
-    family, _, kind = name.partition("_")
-    label = {"koopman": "Koopman"}.get(family, family)
-    about = "EDMD" if kind == "edmd" else words(kind)
-    return f"{label} ({about})" if kind else label
+    family, _, edmd = name.partition("_")
+    return f"{'Koopman' if is_koopman(name) else family}{' (EDMD)' if edmd else ''}"
 
 
 def method_of(name: str) -> Method:
@@ -112,28 +113,24 @@ def observer_look(name: str) -> Look:
     return method_look(name) if method_of(name).baseline or not model else model_look(model)
 
 
-def best_models(names: Iterable[str]) -> list[str]:
-    """Return one linear and one Koopman model to compare: refined ones where there are any, else those of EDMD."""
+def linear_first(by_model: Mapping[str, T]) -> dict[str, T]:
+    """Return what belongs to models in the order in which these are compared."""
+    return dict(sorted(by_model.items(), key=lambda item: is_koopman(item[0])))
+
+
+def observer_pair(names: Iterable[str], first: str | None = None) -> list[str]:
+    """Return an observer, by default the first, behind that of its method for the other model; else a baseline."""
     known = list(names)
-    chosen = [next((n for n in (family, f"{family}_edmd") if n in known), None) for family in ("linear", "koopman")]
-    return [n for n in chosen if n is not None] or known[:2]
-
-
-def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
-    """Return the deployed observer behind that of the same method for the other model; else behind a baseline."""
-    first = deployed if deployed in names else next(iter(names), "")
+    first = first if first in known else next(iter(known), "")
     model, method = split_observer(str(first))
-    other = model.replace("koopman", "linear") if is_koopman(model) else model.replace("linear", "koopman")
-    rivals = (f"{other}/{method}", f"{model}/kalman_tuned", "learned")
-    rival = next((n for n in rivals if n in names and n != first), None)
+    rivals = [n for n in known if split_observer(n)[1] == method] + [f"{model}/kalman_tuned", "learned"]
+    rival = next((n for n in rivals if n in known and n != first), None)
     return [n for n in (rival, first) if n]
 
 
-def paper_pair(names: Iterable[str]) -> list[str]:
-    """Return the paper's linear and Koopman observer, those with entrywise weights where a study has both."""
-    known = list(names)
-    pairs = [[n for n in (f"linear_edmd/{m}", f"koopman_edmd/{m}") if n in known] for m in ("paper", "mixed")]
-    return max(pairs, key=len)
+def published(names: Iterable[str]) -> list[str]:
+    """Return the paper's observers, those with entrywise weights first."""
+    return [n for n in names if split_observer(n)[1] in ("paper", "mixed")]
 
 
 def readable_unit(unit: str) -> str:

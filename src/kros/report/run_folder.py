@@ -22,6 +22,7 @@ from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
 from .manifest import MANIFEST, recorded_files
+from .names import linear_first
 
 Record = dict[str, Any]  # content of an artifact
 
@@ -111,26 +112,31 @@ class RunFolder:
 
     @cached_property
     def models(self) -> dict[str, ModelSet]:
-        """Models of the condition that feeds synthesis, Koopman models first."""
-        models = self._load("models/*/model.json", ModelSet.load, "no models have been identified yet")
-        return dict(sorted(_at_home(models).items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
+        """Models of the condition that feeds synthesis, of EDMD too where they are the start of refined ones."""
+        return self._at_home("models/*/model.json", ModelSet.load, "no models have been identified yet")
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of models that observers are designed for, the leading one first."""
+        return tuple(self._record("models/models.json")["kinds"])
 
     @cached_property
     def uncertain(self) -> dict[str, UncertainModel]:
         """Uncertain models of the condition that feeds synthesis."""
         reason = "the uncertainty has not been quantified yet"
-        return _at_home(self._load("uncertainty/*/*.json", UncertainModel.load, reason))
+        return self._at_home("uncertainty/*/*.json", UncertainModel.load, reason)
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
         """Residuals of all units relative to the weights, by kind of model."""
-        return self._load("uncertainty/*/units/*.json", UnitResiduals.load, "there are no residuals of single units")
+        return self._at_home("uncertainty/*/units/*.json", UnitResiduals.load, "there are no residuals of single units")
 
     @cached_property
     def others(self) -> dict[str, UnitResiduals]:
-        """Residuals of the highest-scoring unit and of all others, by kind of model and condition."""
+        """Residuals of the highest-scoring unit and of all others in its condition, by kind of model."""
         reason = "no unit was compared with the others; at least three units in a condition are needed"
-        return self._load("outliers/*/others/*.json", UnitResiduals.load, reason)
+        residuals = self._load("outliers/*/others/*.json", UnitResiduals.load, reason)
+        return linear_first({name.partition("@")[0]: one for name, one in residuals.items()})
 
     @cached_property
     def outlier_models(self) -> dict[str, OutlierModel]:
@@ -178,7 +184,7 @@ class RunFolder:
             for kind in ("observer/", "model/")
         )
         time_s = np.arange(len(part["states"])) * self.sample_period_s
-        return Shown(key, time_s, part["states"], part["inputs"], observers, models)
+        return Shown(key, time_s, part["states"], part["inputs"], observers, linear_first(models))
 
     def _record(self, name: str) -> Record:
         """Return the content of an artifact; nothing where the run does not have it."""
@@ -194,13 +200,13 @@ class RunFolder:
             raise NotShownError(reason)
         return {name: load(self.folder / folder) for name, folder in folders.items()}
 
+    def _at_home(self, pattern: str, load: Callable[[Path], T], reason: str) -> dict[str, T]:
+        """Load by kind of model what belongs to the condition that feeds synthesis."""
+        of_conditions = self._load(pattern, load, reason)
+        return linear_first({name: one for name, one in of_conditions.items() if "@" not in name})
+
     def _require(self, name: str, reason: str) -> Path:
         """Return the folder of a file, or raise with the reason why it is not there."""
         if not self.has(name):
             raise NotShownError(reason)
         return (self.folder / name).parent
-
-
-def _at_home(artifacts: Mapping[str, T]) -> dict[str, T]:
-    """Return what belongs to the condition that feeds synthesis."""
-    return {name: one for name, one in artifacts.items() if "@" not in name}

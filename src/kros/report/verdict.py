@@ -156,9 +156,7 @@ def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
         text += f"Models and observers describe {len(inside)} of {len(rows)} units, those recorded in "
         text += f"“{condition_label(facts.study['identify_on'])}”."
         yield text, "Record all units in the same conditions.", "recordings"
-    kinds = facts.model, f"{facts.model}_edmd"  # refined models have no share of their own
-    shares = (facts.get("uncertainty", {}).get(kind, {}).get("noise_share") for kind in kinds)
-    noise = next(filter(None, shares), None)
+    noise = facts.get("uncertainty", {}).get(facts.model, {}).get("noise_share")
     if noise and noise["at_peak"] >= THRESHOLDS.noise:
         text = f"{100 * noise['at_peak']:.0f} % of the spread at {number(noise['peak_hz'])} Hz is estimation noise, "
         yield f"{text}not variation between units.", "Record longer, or more episodes.", "spread"

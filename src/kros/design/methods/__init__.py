@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 
 from ...observer import EstimatorSettings
 from ..task import Method, split_name
@@ -30,11 +30,11 @@ def methods_of(names: Iterable[str], estimator: EstimatorSettings | None = None)
     return [Estimator(estimator) if estimator and isinstance(m, Estimator) else m for m in methods]
 
 
-def suitable(methods: Iterable[Method], kind: str, kinds: Collection[str]) -> list[Method]:
-    """Return the methods that are for one of the kinds of models; reasons of others are logged."""
+def suitable(methods: Iterable[Method], kind: str) -> list[Method]:
+    """Return the methods that are for a kind of model; reasons of others are logged."""
     suited = []
     for method in methods:
-        if refusal := method.refusal(kind, kinds):
+        if refusal := method.refusal(kind):
             log.info("%s/%s is not designed: %s.", kind, method.name, refusal)
         else:
             suited.append(method)

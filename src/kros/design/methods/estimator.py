@@ -19,7 +19,6 @@ class Estimator(Method):
     """Regression on filtered measurements and inputs; it is trained with the declared sensors."""
 
     name: ClassVar[str] = "estimator"
-    fits_recordings: ClassVar[bool] = True
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
 
     def design(self, task: DesignTask) -> Design:

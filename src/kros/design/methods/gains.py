@@ -47,7 +47,6 @@ class KalmanTuned(Method):
     """The Kalman filter of a model fitted to single steps, whose process noise does best in training."""
 
     name: ClassVar[str] = "kalman_tuned"
-    fits_recordings: ClassVar[bool] = True
 
     def design(self, task: DesignTask) -> Design:
         """Return the candidate of least error of the hidden states; process noise is like the one-step residuals."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -13,7 +13,7 @@ import numpy as np
 from ... import synthesis, uncertainty  # solvers load when they are used
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, block_diagonal, gain
-from ...identify.model_set import kind_of
+from ...identify.model_set import EDMD
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...uncertainty import residual
 from ...uncertainty.unit_residuals import EntryWeights, fit_entries
@@ -27,10 +27,9 @@ class Mixed(Method):
     name: ClassVar[str] = "mixed"
     time_limit_s: float = 60.0  # of the optimisation
 
-    def refusal(self, kind: str, kinds: Collection[str]) -> str:
-        """Refuse refined models."""
-        lifted = "the paper's problem spends its correction on lifted modes that the nonlinear observer does not have"
-        return lifted if kind_of(kind).refined else ""
+    def refusal(self, kind: str) -> str:
+        """Refuse refined models: the correction is spent on lifted modes that the nonlinear observer does not have."""
+        return "" if kind.endswith(EDMD) else "it is for the paper's models; set identify.refine = false"
 
     def design(self, task: DesignTask) -> Design:
         """Solve the mixed problem."""

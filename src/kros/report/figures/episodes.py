@@ -20,15 +20,14 @@ from ...observer import run_observer
 from ..canvas import Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin
 from ..names import (
     Look,
-    best_models,
     condition_label,
-    deployed_pair,
     episode_title,
     model_label,
     model_look,
     observer_label,
     observer_look,
-    paper_pair,
+    observer_pair,
+    published,
     readable_unit,
     shorten,
     squared,
@@ -71,10 +70,9 @@ class Block:
 def free_run(run: RunFolder) -> tuple[Figure, str]:
     """Draw the simulation of a held-out episode of the nominal unit (the paper's Figures 5 and 6)."""
     shown = run.shown[0]
-    names = best_models(shown.models)
-    if not names:
+    if not shown.models:
         raise NotShownError("no model was simulated on the episode that is shown")
-    lines = {model_label(n): (shown.models[n], model_look(n)) for n in names}
+    lines = {model_label(n): (values, model_look(n)) for n, values in shown.models.items()}
     block = Block(episode_title(shown.key), shown, lines, range(min(len(run.states), DRAWING.states)))
     text = "Simulation from the first recorded state with the recorded inputs, without measurements."
     return _figure(run, [block], text)
@@ -85,10 +83,10 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
     shown = [s for s in run.shown if s.key.condition == run.identify_on][:2]
     if not shown or not shown[0].observers:
         raise NotShownError("no observer was run on the episodes that are shown")
-    known = list(shown[0].observers)
-    names = paper_pair(known) if paper else deployed_pair(known, run.deployed)
+    known = shown[0].observers
+    names = observer_pair(published(known)) if paper else observer_pair(known, run.deployed)
     if not names:
-        raise NotShownError("this study has no observer of the paper's method; add mixed to synthesis.methods")
+        raise NotShownError("the paper's observers are designed with identify.refine = false alone")
     states = range(min(len(run.states), DRAWING.states)) if paper else run.hidden[:2]
     blocks = [
         _observed(f"{role}: unit {one.key.unit}, episode {one.key.episode}", one, names, states)
@@ -100,12 +98,12 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
 
 
 def other_condition(run: RunFolder) -> tuple[Figure, str]:
-    """Draw the paper's pair in a condition that no model has seen (the paper's Figures 13 and 14)."""
+    """Draw the paper's observers, or the deployed one, in a condition that no model has seen (Figures 13 and 14)."""
     shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
     if shown is None or not shown.observers:
         raise NotShownError("the recordings have one condition only")
-    pair = paper_pair(shown.observers)
-    names = pair or deployed_pair(list(shown.observers), run.deployed)
+    pair = observer_pair(published(shown.observers))
+    names = pair or observer_pair(shown.observers, run.deployed)
     block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), DRAWING.states)))
     text = _PAPER if pair else ""
     text += f"Designed in “{condition_label(run.identify_on)}” alone; errors are recorded minus estimated values."

@@ -7,7 +7,7 @@ import numpy as np
 from ...identify import ModelSet
 from ...identify.identified import IdentifiedModels
 from ..canvas import Figure, decibel, frequency_axis, grid, legend, lines_of_units
-from ..names import best_models, is_koopman, model_label, model_look, words
+from ..names import model_label, model_look, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
 from .entries import short
@@ -15,8 +15,7 @@ from .entries import short
 
 def bode(run: RunFolder) -> tuple[Figure, str]:
     """Draw the Koopman models, or the linear ones where there are no others."""
-    chosen = [n for n in best_models(run.models) if is_koopman(n)] or list(run.models)
-    models = run.models[chosen[-1]]
+    models = run.models[run.kinds[0]]
     text = f"{len(models.unit_ids)} {model_label(models.name)} models, every signal over its largest value."
     return bode_figure(models, run.nominal), text
 

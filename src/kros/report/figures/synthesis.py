@@ -10,7 +10,7 @@ from ...core.lti import StateSpace
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis
 from ..canvas import Axes, Figure, decibel, frequency_axis, grid, legend
-from ..names import BASELINES, best_models, method_label, method_look, model_label, split_observer
+from ..names import BASELINES, method_label, method_look, model_label, split_observer
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone
 
@@ -22,7 +22,7 @@ Curve = tuple[str, np.ndarray, str, str]
 def bode(run: RunFolder) -> tuple[Figure, str]:
     """Draw plant, weights and filters, linear beside Koopman (the paper's Figure 10)."""
     robust = {n: s for n, s in run.syntheses.items() if split_observer(n)[1] not in _WITHOUT}
-    chosen = [m for m in best_models(run.models) if any(n.startswith(f"{m}/") for n in robust)]
+    chosen = [m for m in run.models if any(n.startswith(f"{m}/") for n in robust)]
     if not chosen:
         raise NotShownError("no robust observer has been synthesized")
     figure, axes = grid(1, len(chosen), sharey=True)

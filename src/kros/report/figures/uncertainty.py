@@ -25,7 +25,7 @@ from ..canvas import (
     lines_of_units,
     note,
 )
-from ..names import best_models, model_label, number, words
+from ..names import model_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, HUES, Tone
 from .entries import differing, entries_figure, entry_names
@@ -44,7 +44,7 @@ _INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 
 def forms(run: RunFolder) -> tuple[Figure, str]:
     """Draw the largest residuals in all forms, linear beside Koopman (the paper's Figure 7)."""
-    chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
+    chosen = run.uncertain
     tall = {n: m for n, m in chosen.items() if n in run.models and len(m.output_scale) > len(m.input_scale)}
     published = {n: published_bounds(m, run.models[n]) for n, m in tall.items()}  # these contain the identity
     used = words(next(iter(chosen.values())).form.value)
@@ -83,9 +83,8 @@ def draw_forms(axes: Axes, model: UncertainModel) -> None:
 
 def weights(run: RunFolder) -> tuple[Figure, str]:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
-    chosen = {n: run.uncertain[n] for n in best_models(run.unit_residuals) if n in run.uncertain}
-    rows = {n: (model, run.models[n], run.unit_residuals[n]) for n, model in chosen.items()}
-    parts = [f"{model_label(n)} {number(model.overbound_db_max)} dB" for n, model in chosen.items()]
+    rows = {n: (run.uncertain[n], run.models[n], residuals) for n, residuals in run.unit_residuals.items()}
+    parts = [f"{model_label(n)} {number(model.overbound_db_max)} dB" for n, (model, _, _) in rows.items()]
     return weights_figure(rows), (
         "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free. "
         f"Largest mean excess of a weight: {', '.join(parts)}. A unit at most 0 dB is bounded."
@@ -160,7 +159,7 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
 
 def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
     """Draw residuals entry by entry with their fitted weights (the paper's Figure 8 as published)."""
-    chosen = {n: run.unit_residuals[n] for n in best_models(run.unit_residuals)}
+    chosen = run.unit_residuals
     names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
     first = next(iter(chosen.values()))
     text = f"Magnitudes of the entries of all {words(first.form.value)} residuals relative to unit {first.nominal_id}. "
@@ -172,13 +171,11 @@ def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
 
 def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
     """Draw the residual of the highest-scoring unit beside those of the others (the paper's Figure 15)."""
-    residuals = {name.partition("@")[0]: one for name, one in run.others.items()}
-    first = next(iter(residuals.values()))
+    first = next(iter(run.others.values()))
     unit = first.outside[0]
-    chosen = {n: residuals[n] for n in best_models(residuals)}
-    names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
+    names = {n: entry_names(r.form, run.models[n]) for n, r in run.others.items()}
     text = f"Entries of the {words(first.form.value)} residuals relative to unit {first.nominal_id}, weights fitted to "
-    return entries_figure(chosen, names, alarm=unit), text + f"all units but {unit}."
+    return entries_figure(run.others, names, alarm=unit), text + f"all units but {unit}."
 
 
 def sets_figure(models: UncertainModels, kind: str | None = None) -> Figure:

@@ -15,7 +15,7 @@ from ..names import (
     number,
     observer_about,
     observer_label,
-    paper_pair,
+    published,
     split_observer,
     words,
 )
@@ -126,7 +126,7 @@ def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
 
     chosen = [
         *(("deployed", facts.deployed), ("best with a certificate", best(certified))),
-        ("as published", next(iter(paper_pair(table.cells)[::-1]), None)),
+        ("as published", next(iter(published(table.cells)), None)),
         *(("", name) for name in (best(tuned), "learned", "filtered_difference", f"{facts.model}/open_loop")),
     ]
     roles: dict[str, list[str]] = {}

@@ -50,9 +50,9 @@ Task = tuple[Path, Callable[[], Result]]
 def diagnose(context: Context, uncertain: UncertainModels) -> None:
     """Compute and save all of it; what cannot be computed is logged with its reason, and absent."""
     folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
-    pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
-    tasks: list[Task] = [(folder / k / "noise", _noise(context, k, sets[k])) for k in models.edmd_kinds if k in sets]
-    tasks += [(folder / k / "units", partial(residuals_beside_weights, models.models(k), sets[k])) for k in pair]
+    edmd = dict(zip(models.kinds, map(models.models, models.edmd_kinds), strict=True))
+    tasks: list[Task] = [(folder / k / "noise", _noise(context, one, sets[k])) for k, one in edmd.items()]
+    tasks += [(folder / k / "units", partial(residuals_beside_weights, models.models(k), sets[k])) for k in edmd]
     tasks += _others(context, uncertain.scores)
     work = [partial(_attempt, place.parent.name, task) for place, task in tasks]
     for (place, _), result in zip(tasks, context.work.run("quantify (diagnose)", work), strict=True):
@@ -68,17 +68,17 @@ def _attempt(name: str, task: Callable[[], Result]) -> Result | None:
         return None
 
 
-def _noise(context: Context, kind: str, uncertain: UncertainModel) -> Callable[[], NoiseShare]:
-    """Return work that compares variation and noise over some units, the nominal one among them."""
-    units, models = uncertain.unit_ids, context.identified.models(kind)
+def _noise(context: Context, models: ModelSet, uncertain: UncertainModel) -> Callable[[], NoiseShare]:
+    """Return work that compares variation and noise of EDMD models of some units, the nominal one among them."""
+    units = uncertain.unit_ids
     some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
     chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
     recorded = context.identified.factors[context.facts.identify_on]
     rows = np.array(list(zip_longest(*map(recorded.rows_of, chosen), fillvalue=-1))).T  # the last one is zero
     parts = recorded.factor.R, recorded.factor.peak, recorded.factor.n_samples
     factor = Factor(*(np.concatenate([part, np.zeros_like(part[:1])])[rows] for part in parts))
-    lifted = context.identified.models(context.identified.edmd_kinds[0])
-    parameters = {key: values[[lifted.index(u) for u in chosen]][:, None] for key, values in lifted.parameters.items()}
+    values = context.identified.parameters
+    parameters = {name: np.array([[values[u][name]] for u in chosen]) for name in context.lifting.parameters}
     factor = lifted_factor(factor, context.lifting, parameters, models.lifting)
     return partial(
         _compared, factor, (rows >= 0).sum(axis=1).tolist(), models, chosen, uncertain.form, uncertain.nominal_id

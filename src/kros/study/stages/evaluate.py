@@ -95,13 +95,12 @@ def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:
 def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[], Baseline]]:
     """Return what makes every baseline that is no correction of a model, by name."""
     identified, sensor = context.identified, context.config.sensor
-    models = {name: identified.models(name) for name in identified.kinds}
-    first = next(iter(models.values()))
+    first = identified.models()
     training, whole = TrainingSet.of(identified, first, sensor), TrainingSet.whole(identified, first, sensor)
     makers: dict[str, Callable[[], Baseline]] = {}
-    for name in [n for n, m in models.items() if m.lifting.functions or m.lifting.input_functions][:1]:
-        noise = measurement_noise(identified, models[name], sensor)
-        makers[f"{name}/ekf"] = partial(make_extended, training, models[name], context.uncertain.nominal, noise)
+    if first.lifting.functions or first.lifting.input_functions:
+        noise = measurement_noise(identified, first, sensor)
+        makers[f"{first.name}/ekf"] = partial(make_extended, training, first, context.uncertain.nominal, noise)
     profile = partial(make_mean_profile, whole, first.measured, episodes.population, episodes.keys)
     makers["filtered_difference"] = partial(make_difference, training, first.measured)
     makers |= {"mean_profile": profile, "learned": partial(make_learned, whole, first.measured)}

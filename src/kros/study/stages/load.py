@@ -151,7 +151,7 @@ class LoadTrial:
         truth = _truth(context, first), _truth(context, second)
         linear = [("linear", Lifting(population.states))]
         liftings = [("koopman", context.lifting), *linear] if context.lifting.functions else linear
-        measured, dt = context.identified.models(context.identified.kinds[0]).measured, population.sample_period_s
+        measured, dt = context.identified.models().measured, population.sample_period_s
         return cls(known, population.states, measured, first, second, truth, dt, liftings)
 
     @property

@@ -39,6 +39,11 @@ class LoopStatus(StrEnum):
     UNDECIDED
         There is no linear analysis, or its bounds are on both sides of the set.
 
+    Examples
+    --------
+    >>> from kros.evaluate.closed_loop import LoopStatus
+    >>> LoopStatus("SAFE") is LoopStatus.SAFE
+    True
     """
 
     SAFE = "SAFE"
@@ -48,7 +53,14 @@ class LoopStatus(StrEnum):
 
 @dataclass(frozen=True)
 class LoopResult:
-    """What is known about a loop; None is not known."""
+    """What is known about a loop; None is not known.
+
+    Examples
+    --------
+    >>> from kros.evaluate.closed_loop import LoopResult, LoopStatus
+    >>> LoopResult(LoopStatus.UNDECIDED, ("there is no linear analysis",)).lines()[0]
+    'UNDECIDED: there is no linear analysis'
+    """
 
     status: LoopStatus
     reasons: tuple[str, ...] = ()  # of a verdict that is not SAFE
@@ -105,6 +117,16 @@ def close_loop(observer: Observer, uncertain: UncertainModels, controller: Any, 
         Unknown names of signals, another sampling period, matrices that do not fit, or an observer of other lifted
         states than the models'.
 
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.evaluate.closed_loop import Controller, close_loop
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50)
+    >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
+    >>> damper = Controller(D=[[-0.01]], inputs=["velocity"], outputs=motors.inputs, sample_period_s=0.002)
+    >>> close_loop(observer, uncertain, damper, samples=500).status.value
+    'SAFE'
     """
     controller = controller if isinstance(controller, Controller) else Controller.from_system(controller)
     kind = observer.name.partition("/")[0]

@@ -26,6 +26,12 @@ class Controller(Settings):
     Its output is added to the command, ``u = r + K x_hat``: one that opposes has the minus sign in it. Matrices are
     rows of numbers; `limits` are those of the plant's inputs, where actuators have some.
 
+    Examples
+    --------
+    >>> from kros.evaluate.closed_loop import Controller
+    >>> names = {"inputs": ["velocity"], "outputs": ["voltage"], "sample_period_s": 0.001}
+    >>> Controller(D=[[-2.0]], **names).system.n_states
+    0
     """
 
     A: Rows = ()

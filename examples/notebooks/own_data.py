@@ -72,7 +72,7 @@ population = kros.from_arrays(
     sample_period_s=PERIOD,
 )
 print(population)
-kros.report.plot(population)
+population.plot()
 
 # %%
 # Identify
@@ -83,7 +83,7 @@ kros.report.plot(population)
 
 models = kros.identify(population, lifting=["sin(angle)"])
 print(models)
-kros.report.plot(models)
+models.plot()
 
 # %%
 # Quantify how the machines differ
@@ -96,7 +96,7 @@ uncertain = kros.quantify(models, form="additive")
 found = uncertain.sets["koopman"]
 print(uncertain)
 print(f"largest residual over its bound: {found.cover_max:.4f}")
-kros.report.plot(uncertain)
+uncertain.plot()
 
 # %%
 # Synthesize
@@ -110,7 +110,7 @@ design = kros.synthesize(uncertain, "worst_case_h2", methods=())
 estimator = kros.synthesize(uncertain, "koopman/estimator", methods=())
 print(design)
 print(estimator)
-kros.report.plot(design, models=models)
+design.plot(models=models)
 
 # %%
 # Run it on a new machine

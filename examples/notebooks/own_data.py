@@ -71,7 +71,7 @@ population = kros.from_arrays(
     measured=["angle"],
     sample_period_s=PERIOD,
 )
-print(population)
+print(population.summary())
 population.plot()
 
 # %%
@@ -82,8 +82,13 @@ population.plot()
 # linear in angle, rate and sine. kros also identifies linear models without it. The last episode of every machine is held out.
 
 models = kros.identify(population, lifting=["sin(angle)"])
-print(models)
+print(models.summary())
 models.plot()
+
+# %%
+# Simulate a held-out episode with the models of its machine. Above the signals stands the fit: 100 percent is exact.
+
+models.plot("compare")
 
 # %%
 # Quantify how the machines differ

@@ -144,12 +144,12 @@ class ModelSet(Shown, Storable):
 
         They last until the slowest pole has decayed to 1 %, at most about as long as the longest episode.
         """
-        slowest, n, period = self.spectral_radius().max(), self.lifting.n_states, self.sample_period_s
+        slowest, period = self.spectral_radius().max(), self.sample_period_s
         settled = np.log(0.01) / np.log(slowest) if 0 < slowest < 1 else points
         stride = int(np.ceil(min(settled, (self.longest_s or np.inf) / period) / points))
         state, states = np.zeros_like(self.B), []
         for sample in range(points * stride + 1):
-            states += [] if sample % stride else [state[:, :n]]
+            states += [] if sample % stride else [state[:, : self.lifting.n_states]]
             state = self.A @ state + self.B
         return np.arange(len(states)) * stride * period, np.stack(states, axis=1)
 

@@ -249,9 +249,10 @@ def compare_figure(
     runs = [held_out.models(models.models(name, condition)).shown[0] for name in names]
     lines = {model_label(name): (values, model_look(name)) for name, values in zip(names, runs, strict=True)}
     figure = _episode_figure(models.population, batch, lines)
-    fits = np.transpose([fit_percent(values, batch.states[:, 0]) for values in runs])
-    for panel, percent in zip(figure.axes[1::4], fits, strict=True):
-        panel.set_title(f"fit {joined(list(map(number, percent)))} %")
+    figure.axes[0].set_title(f"{episode_title(key)}\n")  # above the fits, which stand beside it
+    fits = [fit_percent(values, batch.states[:, 0]) for values in runs]
+    for panel, *percent in zip(figure.axes[1::4], *fits, strict=True):
+        panel.set_title(f"fit {joined([number(value) for value in percent])} %")
     return figure
 
 

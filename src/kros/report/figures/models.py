@@ -83,7 +83,7 @@ def residuals_figure(
     key = shown_episode(models, unit, condition)
     batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
     chosen, signals = models.models(model, condition), (batch.states, batch.inputs, batch.parameters)
-    row, lifting, look = chosen.index(key.unit), chosen.lifting, model_look(chosen.name)
+    row, lifting = chosen.index(key.unit), chosen.lifting
     residual = one_step_residual(lifting, chosen.A[row], chosen.B[row], *signals)[:, 0]
     band = ndtri((1 + DRAWING.white) / 2) / np.sqrt(len(residual))
     inputs = batch.inputs[-len(residual) :, 0].T[: DRAWING.states]
@@ -94,7 +94,9 @@ def residuals_figure(
             panel.axhspan(
                 -band, band, color=Tone.GRID.light, lw=0, label=f"{100 * DRAWING.white:g} % band of white noise"
             )
-            panel.vlines(np.arange(len(lines)), 0, lines, color=look.colour, label=model_label(chosen.name))
+            panel.vlines(
+                np.arange(len(lines)), 0, lines, color=model_look(chosen.name).colour, label=model_label(chosen.name)
+            )
         panels[0].set_ylabel(short(name))
     for panel, name in zip(axes[0], ("itself", *chosen.recorded_inputs), strict=False):
         panel.set_title(f"residual with\n{short(name)}")

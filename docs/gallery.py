@@ -1,4 +1,4 @@
-"""Figures of notebooks for sphinx-gallery: a figure that the last line of a cell returns, as `kros.report.plot` does, which pyplot does not know."""
+"""Figures of notebooks for sphinx-gallery: a figure that the last line of a cell returns, as the method `plot` of results does, which pyplot does not know."""
 
 from __future__ import annotations
 

@@ -104,9 +104,8 @@ print("states of the weights:", chosen.left.nstates, "and", chosen.right.nstates
 print(chosen.certificate)
 
 # %%
-import kros
-
-kros.report.plot(chosen.model)
+print(chosen.model.summary())
+chosen.model.plot()
 
 # %%
 # Check it by hand

@@ -71,8 +71,8 @@ population = kros.from_arrays(
     measured=["angle"],
     sample_period_s=PERIOD,
 )
-print(population)
-kros.report.plot(population)
+print(population.summary())
+population.plot()
 
 # %%
 # Identify
@@ -82,8 +82,13 @@ kros.report.plot(population)
 # linear in angle, rate and sine. kros also identifies linear models without it. The last episode of every machine is held out.
 
 models = kros.identify(population, lifting=["sin(angle)"])
-print(models)
-kros.report.plot(models)
+print(models.summary())
+models.plot()
+
+# %%
+# Simulate a held-out episode with the models of its machine. Above the signals stands the fit: 100 percent is exact.
+
+models.plot("compare")
 
 # %%
 # Quantify how the machines differ
@@ -96,7 +101,7 @@ uncertain = kros.quantify(models, form="additive")
 found = uncertain.sets["koopman"]
 print(uncertain)
 print(f"largest residual over its bound: {found.cover_max:.4f}")
-kros.report.plot(uncertain)
+uncertain.plot()
 
 # %%
 # Synthesize
@@ -110,7 +115,7 @@ design = kros.synthesize(uncertain, "worst_case_h2", methods=())
 estimator = kros.synthesize(uncertain, "koopman/estimator", methods=())
 print(design)
 print(estimator)
-kros.report.plot(design, models=models)
+design.plot(models=models)
 
 # %%
 # Run it on a new machine

@@ -287,9 +287,7 @@ def run(
 
 
 def _finish(result: Any, quiet: bool) -> None:
-    from .study.commands.summary import summary_lines
-
-    _show(quiet, result.metrics, [] if quiet else summary_lines(result))
+    _show(quiet, result.metrics, [] if quiet else result.summary().splitlines()[1:])
 
 
 @app.command()

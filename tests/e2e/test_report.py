@@ -23,7 +23,6 @@ from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace
 from kros.identify import PhaseCalibration, PhaseSpec
 from kros.identify.calibration import UnitPhase
-from kros.report import plot
 from kros.report.figures import FIGURES, draw, draw_all
 from kros.report.figures.entries import entry_names
 from kros.report.figures.recordings import phase_figure
@@ -265,29 +264,31 @@ def test_results_of_the_short_way_are_plotted(demo, metrics) -> None:
     design = package.synthesize(uncertain, "kalman_tuned", methods=())
     before = dict(matplotlib.rcParams)
     for result in (motors, models, uncertain, next(iter(uncertain.sets.values())), RunResult(demo, metrics)):
-        figure = plot(result)
+        figure = result.plot()
         assert isinstance(figure, Figure)
         assert figure.axes
     assert dict(matplotlib.rcParams) == before
-    drawn = plot(design, models=models).axes[4].lines
+    drawn = design.plot(models=models).axes[4].lines
     assert [line.get_label() for line in drawn] == ["recorded", observer_label(design.observer.name)]
     run = RunResult(demo, metrics)
-    assert len(plot(run, name="phase").axes) == 3
+    assert len(run.plot(name="phase").axes) == 3
+    assert run.summary().startswith("RunResult\n")
     for wrong, options, match in (
         (run, {"name": "beauty"}, "no figure 'beauty'"),
-        (uncertain, {"kind": "koopman"}, "no set of kind 'koopman'"),
+        (uncertain, {"model": "koopman"}, "there are none, only linear_edmd"),
         (design, {}, "give models="),
-        (3, {}, "got a int"),
+        (models, {"kind": "beauty"}, "no figure of kind 'beauty'; choose one of bode, step, residuals, compare"),
+        (motors, {"size": 3}, "no option size; 'recorded' has unit, condition"),
     ):
-        with pytest.raises(ConfigError, match=match):
-            plot(wrong, **options)
+        with pytest.raises((ConfigError, DataError), match=match):
+            wrong.plot(**options)
 
 
 def test_drawing_leaves_pyplot_alone() -> None:
     code = (
         "import sys, kros, kros.report; assert 'matplotlib' not in sys.modules;"
         "motors = kros.plants.DcMotorPopulation(n_units=1, n_episodes=1, seconds=1.0).simulate().population;"
-        "kros.report.plot(motors); assert 'matplotlib.pyplot' not in sys.modules"
+        "motors.plot(); assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

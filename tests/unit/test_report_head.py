@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from kros.report.error_tables import error_tables
 from kros.report.facts import Facts
 from kros.report.sections.errors import errors
 from kros.report.verdict import Status, judge
-from kros.study.commands.summary import ranking, summary_lines
+from kros.study.commands.summary import ranking
 from kros.study.pipeline import RunResult
 
 NAME = "koopman/estimator"
@@ -163,13 +164,19 @@ def test_the_mean_is_geometric_and_infinite_where_an_estimate_diverged() -> None
 
 
 def test_a_run_ends_with_a_verdict_numbers_and_a_path(tmp_path: Path) -> None:
-    verdict, numbers, path = summary_lines(RunResult(tmp_path, metrics(outliers=[FLAGGED])))
+    verdict, error, flagged, path = lines_of(RunResult(tmp_path, metrics(outliers=[FLAGGED])))
     assert verdict.startswith("CHECK: “Koopman, estimator” estimates velocity from angle. Check 1 point")
-    assert numbers == "error of velocity 0.200 % of the largest value (worst unit b: 0.200 %); units flagged 1 of 1 (b)"
+    assert error == "error of velocity: 0.200 % of the largest value (worst unit b: 0.200 %)"
+    assert flagged == "units flagged: 1 of 1 (b)"
     assert path == f"results: {tmp_path}"
-    early, alert, _ = summary_lines(RunResult(tmp_path, metrics(study={"deployed": None, "alerts": ["stuck"]})))
-    assert early == "3 units: no observer has been designed yet"
+    early, alert, _ = lines_of(RunResult(tmp_path, metrics(study={"deployed": None, "alerts": ["stuck"]})))
+    assert early == "units: 3, no observer has been designed yet"
     assert alert == "check: stuck"
+
+
+def lines_of(result: RunResult) -> list[str]:
+    """Return the lines of a summary, each with a colon in place of the space between name and text."""
+    return [re.sub("  +", ": ", line) for line in result.summary().splitlines()[1:]]
 
 
 def test_observers_are_ranked_by_their_errors() -> None:

@@ -79,6 +79,8 @@ Tables of preparation steps are no longer parsed by a public function; use kros.
     kros.data.steps: parse_steps
 Report and figures of a run are no longer written by public functions; use kros report and kros figures.
     kros.report: render write_figures
+Results are no longer drawn by a function; use their method plot, such as models.plot().
+    kros.report: plot
 Models of units are no longer converted by a function of their own; use to_control(models.systems([unit])[0]).
     kros.interop: models_to_control
 The array format of pykoop is no longer in kros.data; use from_pykoop and to_pykoop of kros.interop.

@@ -19,6 +19,7 @@ import numpy as np
 from ..core.arrays import Array
 from ..core.errors import DataError
 from ..core.settings import member
+from .shown import Shown
 
 DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
@@ -68,6 +69,11 @@ class Channel:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "role", member(Role, self.role, f"Channel {self.name}: the role"))
+
+    @property
+    def label(self) -> str:
+        """Name with unit of measure, and whether it is measured."""
+        return f"{self.name} ({self.unit or '1'}{', measured' * self.measured})"
 
 
 @dataclass(frozen=True)
@@ -152,7 +158,7 @@ class Split:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Population:
+class Population(Shown):
     """Recordings of nominally identical machines.
 
     Parameters
@@ -200,6 +206,12 @@ class Population:
         true = f"; true {', '.join(t.of for t in self.truths)}" if self.truths else ""
         channels = f"states {states}; inputs {', '.join(self.inputs) or 'none'}{true}"
         return f"Population({sizes} every {self.sample_period_s:g} s; {channels})"
+
+    def _summary_rows(self) -> dict[str, Any]:
+        first = f", the first with {len(self.read(self.episodes[0]))} samples" if self.episodes else ""
+        rows = {f"{role.value}s": ", ".join(c.label for c in self.columns if c.role is role) for role in Role}
+        rows |= {"conditions": ", ".join(self.conditions), "episodes": f"{len(self.episodes)}{first}"}
+        return {"units": len(self.unit_ids), "period": f"{self.sample_period_s:g} s", **rows}
 
     @property
     def columns(self) -> tuple[Channel, ...]:

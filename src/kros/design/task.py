@@ -14,6 +14,7 @@ from ..core.arrays import Array, frozen
 from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import SynthesisError
 from ..core.lti import gain
+from ..data.shown import Shown
 from ..identify import ModelSet
 from ..observer import Observer, ReliftCertificate, Runtime
 from ..observer.sensor import Sensors, delay_of
@@ -38,7 +39,7 @@ class Method(ABC):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Design:
+class Design(Shown):
     """One observer with what is known about it, in the recordings' units.
 
     Parameters
@@ -76,6 +77,13 @@ class Design:
         finite = percent is not None and np.isfinite(percent)
         error = f"training error {percent:.3g} %" if finite else "diverges in training"
         return f"<Design {self.name}: {self.facts.get('order')} states in the correction, {error}, {known}>"
+
+    def _summary_rows(self) -> dict[str, Any]:
+        facts = self.facts
+        rows = {f"bound of {state}, %": bound for state, bound in facts.get("set_bound_percent", {}).items()}
+        rows |= {"training error, %": facts.get("hidden_error_percent"), "lower bound": self.lower_bound}
+        rows |= {"worst-case H2": facts.get("worst_case_h2"), "certificate": self.certificate}
+        return self.observer._summary_rows() | rows | {"certified": self.certified}
 
     @property
     def certified(self) -> bool:

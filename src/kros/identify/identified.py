@@ -15,6 +15,7 @@ from ..core.arrays import frozen
 from ..core.artifacts import Storable, load_artifact, loader, save_artifact
 from ..core.errors import DataError
 from ..data.population import Population
+from ..data.shown import Shown
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor
@@ -68,7 +69,7 @@ class EpisodeFactors(Storable):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class IdentifiedModels:
+class IdentifiedModels(Shown):
     """What `kros.identify` returns.
 
     Examples
@@ -92,6 +93,17 @@ class IdentifiedModels:
     def __repr__(self) -> str:
         kinds, facts = ", ".join(self.kinds), self.facts
         return f"<IdentifiedModels: {kinds} of {len(facts.pooled)} units, identified on {facts.identify_on!r}>"
+
+    def _summary_rows(self) -> dict[str, Any]:
+        facts = self.facts
+        episodes = f"{len(facts.train)} in training, {len(facts.test)} held out, {len(facts.dropped)} left out"
+        rows: dict[str, Any] = {
+            "units": len(facts.pooled),
+            "episodes": episodes,
+            "functions": ", ".join(self.lifting.functions),
+        }
+        rows |= {kind: self.models(kind).about for kind in self.kinds}
+        return rows | {"conditions": ", ".join(self.conditions), "alerts": " ".join(facts.alerts)}
 
     @property
     def edmd_kinds(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ..core.artifacts import Storable, divided, load_artifact, loader, save_arti
 from ..core.frequency import log_grid
 from ..core.lti import StateSpace
 from ..data.population import Channel, Role
+from ..data.shown import Shown
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
 from .factors import Ranges
@@ -22,7 +24,7 @@ EDMD = "_edmd"  # at the end of the paper's kinds of models
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ModelSet(Storable):
+class ModelSet(Shown, Storable):
     """Koopman (or linear) models of all units, identified in one condition.
 
     Examples
@@ -73,6 +75,17 @@ class ModelSet(Storable):
         units = f"{len(self.unit_ids)} units in condition {self.condition!r}"
         outputs, inputs = ", ".join(self.lifting.names), ", ".join(self.inputs)
         return f"ModelSet({self.name!r}: {units}; lifted states {outputs}; inputs {inputs})"
+
+    def _summary_rows(self) -> dict[str, Any]:
+        functions = self.lifting.functions + self.lifting.input_functions
+        rows = {"kind": self.name, "condition": self.condition, "units": len(self.unit_ids), "models": self.about}
+        rows |= {"channels": ", ".join(c.label for c in self.channels), "functions": ", ".join(functions)}
+        return rows | {"period": f"{self.sample_period_s:g} s"}
+
+    @property
+    def about(self) -> str:
+        """Order and largest spectral radius in a few words."""
+        return f"order {self.lifting.n_lifted}, spectral radius at most {self.spectral_radius().max():.6g}"
 
     @property
     def recorded_inputs(self) -> tuple[str, ...]:
@@ -126,6 +139,20 @@ class ModelSet(Storable):
     def scaled_responses(self, freqs_hz: ArrayLike, units: Sequence[str] | None = None) -> AnyArray:
         """Return the same with every signal divided by its range."""
         return self.normalised().systems(units).frequency_response(freqs_hz)
+
+    def step_responses(self, points: int) -> tuple[AnyArray, AnyArray]:
+        """Return times, s, and responses of states from rest to unit steps of the inputs, (unit, time, n, m).
+
+        They last until the slowest pole has decayed to 1 %, at most about as long as the longest episode.
+        """
+        slowest, period = self.spectral_radius().max(), self.sample_period_s
+        settled = np.log(0.01) / np.log(slowest) if 0 < slowest < 1 else points
+        stride = int(np.ceil(min(settled, (self.longest_s or np.inf) / period) / points))
+        state, states = np.zeros_like(self.B), []
+        for sample in range(points * stride + 1):
+            states += [] if sample % stride else [state[:, : self.lifting.n_states]]
+            state = self.A @ state + self.B
+        return np.arange(len(states)) * stride * period, np.stack(states, axis=1)
 
     def systems(self, units: Sequence[str] | None = None) -> StateSpace:
         """Return the models as a batch from input to lifted state, all of it or some units."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from ..core.arrays import Array, ArrayLike, Parameters
 from ..core.lti import gain
+from ..data.shown import Shown
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .data import ObserverData
@@ -18,7 +19,7 @@ from .running import RunningObserver
 from .simulate import run_observer
 
 
-class Observer(ObserverData):
+class Observer(Shown, ObserverData):
     """An observer; its fields are those of `ObserverData`.
 
     Examples
@@ -33,6 +34,12 @@ class Observer(ObserverData):
     >>> running.step([0.5], [2.0])["velocity"]
     0.2
     """
+
+    def _summary_rows(self) -> dict[str, Any]:
+        order = f"{self.controller.n_states} of the correction, {self.internal} internal states"
+        rows = {"name": self.name, "states": ", ".join(self.recorded), "measured": ", ".join(self.outputs)}
+        rows |= {"inputs": ", ".join(self.inputs), "functions": ", ".join(self.lifting.functions), "order": order}
+        return rows | {"period": f"{self.sample_period_s:g} s"}
 
     @classmethod
     def open_loop(

@@ -77,12 +77,12 @@ def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, fl
 
 def thin(x: AnyArray, y: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return a line with fewer points that looks the same: smallest and largest value of every bucket, in order."""
-    count = DRAWING.points
-    size = len(y) // count
+    size = -(-len(y) // DRAWING.points)
     if size < 3:
         return x, y
-    blocks = np.where(np.isfinite(y), y, 0.0)[: size * count].reshape(count, size)
-    starts = np.arange(count) * size
+    values = np.pad(np.where(np.isfinite(y), y, 0.0), (0, -len(y) % size), mode="edge")
+    blocks = values.reshape(-1, size)
+    starts = np.arange(len(blocks)) * size
     rows = np.unique(np.concatenate([starts + blocks.argmin(axis=1), starts + blocks.argmax(axis=1), [len(y) - 1]]))
     return x[rows], y[rows]
 

@@ -1,4 +1,4 @@
-"""Plots of results in memory: one verb, the figure that suits the result."""
+"""Figures of results in memory, behind their method `plot`."""
 
 from __future__ import annotations
 
@@ -12,58 +12,38 @@ from .theme import style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PLOTS = {
-    "Population": "recordings:population_figure",
-    "IdentifiedModels": "models:identified_figure",
-    "UncertainModel": "uncertainty:uncertain_figure",
-    "UncertainModels": "uncertainty:sets_figure",
-    "Design": "episodes:design_figure",
-    "RunResult": ":run_figure",
+_ESTIMATES = {"estimates": "episodes:design_figure"}
+PLOTS: dict[str, dict[str, str]] = {
+    "Population": {"recorded": "recordings:population_figure", "excitation": "recordings:excitation_figure"},
+    "ModelSet": {"bode": "models:bode_figure", "step": "models:step_figure"},
+    "IdentifiedModels": {
+        "bode": "models:identified_bode",
+        "step": "models:identified_step",
+        "residuals": "models:residuals_figure",
+        "compare": "episodes:compare_figure",
+    },
+    "UncertainModel": {"weights": "uncertainty:uncertain_figure"},
+    "UncertainModels": {"weights": "uncertainty:sets_figure"},
+    "Design": _ESTIMATES,
+    "Observer": _ESTIMATES,
+    "RunResult": {"figure": ":run_figure"},
 }
-"""Name of a result's class -> module and function that draws it; further parameters are the options of `plot`."""
+"""Class -> kind of figure -> module and function that draws it; its further parameters are the options of `plot`."""
 
 
-def plot(result: Any, **options: Any) -> Figure:
-    """Return a figure of a result.
-
-    Parameters
-    ----------
-    result : one of the classes in `PLOTS`
-        A population: its first episode. Models: Bode plots. Uncertain models: weights, every unit relative to them.
-        A design: the estimates on a held-out episode. A run: the estimates.
-    **options
-        ``kind`` of identified and uncertain models, such as ``"linear"``; ``models`` of a design, the identified models
-        behind it; ``name`` of a run, any of its figures.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Not known to pyplot; notebooks show it, `figure.savefig(...)` writes it.
-
-    Raises
-    ------
-    ConfigError
-        For anything else, and for options that the result does not have.
-
-    Examples
-    --------
-    >>> import kros
-    >>> motors = kros.plants.DcMotorPopulation(n_units=1, n_episodes=1, seconds=1.0).simulate().population
-    >>> len(kros.report.plot(motors).axes)  # position, velocity, current and voltage
-    4
-    """
-    kinds = (t.__name__ for t in type(result).__mro__ if t.__module__.startswith("kros."))
-    name = next((kind for kind in kinds if kind in PLOTS), None)
-    if name is None:
-        known_kinds = ", ".join(PLOTS)
-        raise ConfigError(f"Plot: got a {type(result).__name__}; give one of {known_kinds}, or render a run folder.")
-    module, _, function = PLOTS[name].partition(":")
+def plot(result: Any, kind: str | None, **options: Any) -> Figure:
+    """Draw a result."""
+    name = next(t.__name__ for t in type(result).__mro__ if t.__name__ in PLOTS)
+    kinds = PLOTS[name]
+    kind = kind or next(iter(kinds))
+    if kind not in kinds:
+        raise ConfigError(f"Plot: a {name} has no figure of kind {kind!r}; choose one of {', '.join(kinds)}.")
+    module, _, function = kinds[kind].partition(":")
     draw = getattr(import_module(f"{__package__}.figures.{module}".rstrip(".")), function)
     known = list(signature(draw).parameters)[1:]
-    unknown = sorted(set(options) - set(known))
-    if unknown:
+    if not set(options) <= set(known):
         raise ConfigError(
-            f"Plot: a {name} has no option {', '.join(map(repr, unknown))}; it has {', '.join(known) or 'none'}."
+            f"Plot: a {name} has no option {', '.join(options)}; {kind!r} has {', '.join(known) or 'none'}."
         )
     with style():
         figure: Figure = draw(result, **options)

@@ -13,7 +13,10 @@ from ..core.settings import member
 from ..core.work import Executor, Progress, Work
 from ..data import Population
 from ..data.readers.opening import detect_reader
+from ..data.shown import Shown
 from ..observer import Observer
+from ..report.facts import Facts
+from ..report.verdict import judge
 from .config import Stage, StudyConfig, load_config, validate_config
 from .engine.context import Context, StageStep, run_steps
 from .engine.executors import open_executor
@@ -32,7 +35,7 @@ STEPS = (
 
 
 @dataclass(frozen=True, repr=False)
-class RunResult:
+class RunResult(Shown):
     """What a run left behind.
 
     Examples
@@ -52,6 +55,16 @@ class RunResult:
     def __repr__(self) -> str:
         study = self.metrics["study"]
         return f"<RunResult {self.folder}: {study['units']} units, deployed is {study.get('deployed')}>"
+
+    def _summary_rows(self) -> dict[str, Any]:
+        facts, report = Facts(self.metrics), self.folder / "report.html"
+        place = {"report": report} if report.exists() else {"results": self.folder}
+        if not facts.deployed:
+            units = f"{facts.study['units']}, no observer has been designed yet"
+            return {"units": units, "check": " ".join(facts.study.get("alerts", ())), **place}
+        verdict = judge(facts)
+        numbers = {n.label: f"{n.value} {n.unit} ({n.notes[-1]})" for n in verdict.numbers}
+        return {verdict.status.value: verdict.sentence, **numbers, **place}
 
     @property
     def observer(self) -> Observer:

@@ -9,12 +9,14 @@ S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..core.arrays import AnyArray
 from ..core.artifacts import Storable
 from ..core.lti import StateSpace
+from ..data.shown import Shown
 from .forms import Form
 from .weights.cover import Cover, Weight
 
@@ -39,6 +41,12 @@ class Uncertainty:
         AnyArray  # (unit, frequency): what the form cannot rebuild, relative to the unit; NaN near singular inverses
     )
     remainder: Weight | None = None  # for `Gp - rebuilt(G, E)`, additive, where the form does not rebuild every unit
+
+    @property
+    def about(self) -> str:
+        """Form, largest residual and order of the weights in a few words."""
+        order = sum(self.weight.left_orders + self.weight.right_orders)
+        return f"{self.form.value}, peak {self.peak_db[self.form]:.3g} dB, weights of order {order}"
 
     @property
     def peak_db(self) -> dict[Form, float]:
@@ -97,7 +105,7 @@ class ResponseUncertainty(Uncertainty):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class UncertainModel(Uncertainty, Storable):
+class UncertainModel(Shown, Uncertainty, Storable):
     """A nominal model and a bound on how the units of the population differ from it.
 
     Parameters
@@ -125,6 +133,12 @@ class UncertainModel(Uncertainty, Storable):
 
     KIND = "uncertain_model"
     nominal_system: StateSpace
+
+    def _summary_rows(self) -> dict[str, Any]:
+        nominal = f"unit {self.nominal_id}, {self.nominal_system.n_states} states"
+        rows = {"units": len(self.unit_ids), "nominal": nominal, "uncertainty": self.about}
+        rows |= {"residual over bound": self.cover_max, "bound above optimum": f"{self.overbound_db_max:.3g} dB"}
+        return rows | {f"peak, {form.value}": f"{peak:.3g} dB" for form, peak in self.peak_db.items()}
 
     @property
     def sample_period_s(self) -> float:

@@ -20,6 +20,7 @@ from ..core.artifacts import load_artifact, loader, read_json, save_artifact, wr
 from ..core.errors import ConfigError, IdentificationError
 from ..core.linalg import sigma_max
 from ..core.work import Work
+from ..data.shown import Shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
 from .bounded import bound_responses, bound_systems
@@ -37,7 +38,7 @@ _FACTS = ("nominal", "worst_off_nominal")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class UncertainModels:
+class UncertainModels(Shown):
     """What `kros.quantify` returns for models of `kros.identify`.
 
     Examples
@@ -60,6 +61,12 @@ class UncertainModels:
         flagged = sum(bool(row["outlier"]) for row in self.scores)
         kinds, scores = ", ".join(self.sets), f"{flagged} of {len(self.scores)} outlier scores flagged"
         return f"<UncertainModels: {kinds}, nominal unit {self.nominal}, {scores}>"
+
+    def _summary_rows(self) -> dict[str, Any]:
+        flagged = [f"{row['unit']} ({row['condition']})" for row in self.scores if row["outlier"]]
+        rows: dict[str, Any] = {kind: uncertain.about for kind, uncertain in self.sets.items()}
+        rows |= {"nominal unit": self.nominal, "farthest unit": self.worst_off_nominal}
+        return rows | {"outliers": ", ".join(flagged) or "none"}
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with models and recordings, in the layout of a run folder."""

@@ -5,15 +5,17 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ...core.arrays import AnyArray
 from ...core.errors import ConfigError
 from ...data import EpisodeBatch
-from ...data.population import Channel, Role
-from ...design import Design
+from ...data.population import Channel, EpisodeKey, Population, Role
+from ...evaluate import fit_percent
 from ...evaluate.errors import error_spectrum
+from ...evaluate.held_out import HeldOut
 from ...evaluate.sensor import as_shown
 from ...identify.identified import IdentifiedModels
 from ...observer import run_observer
@@ -22,8 +24,11 @@ from ..names import (
     Look,
     condition_label,
     episode_title,
+    is_koopman,
+    joined,
     model_label,
     model_look,
+    number,
     observer_label,
     observer_look,
     observer_pair,
@@ -36,6 +41,7 @@ from ..names import (
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
 
+Lines = Mapping[str, tuple[AnyArray, Look]]
 TRUTH = Look(Tone.INK.light, weight=2, opacity=DRAWING.shade)
 _PAPER = "The paper's observers: mixed H2-H∞ synthesis on models of EDMD. "
 
@@ -63,7 +69,7 @@ class Block:
 
     title: str
     shown: Shown
-    lines: Mapping[str, tuple[AnyArray, Look]]  # values, shape (n_samples, n), by label
+    lines: Lines  # values, shape (n_samples, n), by label
     states: Sequence[int]
 
 
@@ -171,7 +177,7 @@ def _inside(values: AnyArray, recorded: AnyArray) -> AnyArray:
     return np.where((values >= recorded.min() - room) & (values <= recorded.max() + room), values, np.nan)
 
 
-def draw_lines(axes: Axes, time_s: AnyArray, lines: Mapping[str, tuple[AnyArray, Look]], width: float = 1.0) -> None:
+def draw_lines(axes: Axes, time_s: AnyArray, lines: Lines, width: float = 1.0) -> None:
     """Draw lines over time, later ones in front."""
     for label, (values, look) in lines.items():
         x, y = thin(time_s, values)
@@ -221,17 +227,53 @@ def steady_stretches(speed: AnyArray) -> list[tuple[int, int]]:
     return sorted(stretches)
 
 
-def design_figure(design: Design, models: IdentifiedModels | None = None) -> Figure:
-    """Draw estimates of an observer on the first held-out episode of the units behind its models."""
+def shown_episode(models: IdentifiedModels, unit: str | None, condition: str | None) -> EpisodeKey:
+    """Return the first held-out episode, else a training one, of a unit or of the pooled ones."""
+    facts, where = models.facts, condition or models.facts.identify_on
+    units = [u for u in models.models(models.edmd_kinds[0], condition).unit_ids if unit or u in facts.pooled]
+    keys = [k for part in ("test", "train") for k in facts.keys(part, unit, where) if k.unit in units]
+    if not keys:
+        raise ConfigError(f"Plot: unit {unit!r} has no episode in condition {where!r} with a model; name another one.")
+    return keys[0]
+
+
+def compare_figure(
+    models: IdentifiedModels, model: str | None = None, unit: str | None = None, condition: str | None = None
+) -> Figure:
+    """Draw simulations from the first recorded states beside the recording, with their fit in percent."""
+    key = shown_episode(models, unit, condition)
+    names = [model] if model else sorted(models.edmd_kinds if condition else models.kinds, key=is_koopman)
+    held_out = HeldOut(models.population, (key,), models.parameters, shown=(0,))
+    batch = held_out.read([key])
+    runs = [held_out.models(models.models(name, condition)).shown[0] for name in names]
+    lines = {model_label(name): (values, model_look(name)) for name, values in zip(names, runs, strict=True)}
+    figure = _episode_figure(models.population, batch, lines)
+    figure.axes[0].set_title(f"{episode_title(key)}\n")  # above the fits, which stand beside it
+    fits = [fit_percent(values, batch.states[:, 0]) for values in runs]
+    for panel, *percent in zip(figure.axes[1::4], *fits, strict=True):
+        panel.set_title(f"fit {joined([number(value) for value in percent])} %")
+    return figure
+
+
+def design_figure(
+    design: Any, models: IdentifiedModels | None = None, unit: str | None = None, condition: str | None = None
+) -> Figure:
+    """Draw estimates of a design, or of an observer, on a held-out episode of a unit behind its models."""
     if models is None:
         raise ConfigError("Plot of a design: give models= the identified models, whose recordings it runs on.")
-    observer, facts = design.observer, models.facts
-    key = next(k for k in facts.keys("test", condition=facts.identify_on) if k.unit in facts.pooled)
+    observer = getattr(design, "observer", design)
+    key = shown_episode(models, unit, condition)
     batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
     y = as_shown(batch, observer.sensor, models.population.states).measurements(observer.measured)
     estimate = run_observer(observer, y, batch.inputs, batch.parameters or None)[:, 0]
-    time_s = np.arange(len(estimate)) * batch.sample_period_s
-    shown = Shown(key, time_s, batch.states[:, 0], batch.inputs[:, 0], {observer.name: estimate}, {})
-    channels = models.population.channels
-    block = _observed(episode_title(key), shown, [observer.name], range(shown.states.shape[1]))
-    return blocks_figure(Signals(channels, batch.sample_period_s, len(time_s) // 8), [block])
+    lines = {observer_label(observer.name): (estimate, observer_look(observer.name))}
+    return _episode_figure(models.population, batch, lines)
+
+
+def _episode_figure(population: Population, batch: EpisodeBatch, lines: Lines) -> Figure:
+    """Draw all states of one episode beside what was estimated or simulated."""
+    (key,), states = batch.keys, batch.states[:, 0]
+    time_s = np.arange(len(states)) * batch.sample_period_s
+    shown = Shown(key, time_s, states, batch.inputs[:, 0], {}, {})
+    block = Block(episode_title(key), shown, lines, range(states.shape[1]))
+    return blocks_figure(Signals(population.channels, batch.sample_period_s, len(time_s) // 8), [block])

@@ -1,16 +1,20 @@
-"""Bode plots of the identified models: magnitude and phase of every unit."""
+"""Identified models: magnitude and phase, step responses of every unit, and correlations of one-step residuals."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ...data import EpisodeBatch
+from ...evaluate.validation import correlation
 from ...identify import ModelSet
 from ...identify.identified import IdentifiedModels
-from ..canvas import Figure, decibel, frequency_axis, grid, legend, lines_of_units
-from ..names import model_label, model_look, words
+from ...observer.residual import one_step_residual
+from ..canvas import Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units
+from ..names import model_label, model_look, readable_unit, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
 from .entries import short
+from .episodes import label_rows, shown_episode
 
 
 def bode(run: RunFolder) -> tuple[Figure, str]:
@@ -20,9 +24,14 @@ def bode(run: RunFolder) -> tuple[Figure, str]:
     return bode_figure(models, run.nominal), text
 
 
-def identified_figure(models: IdentifiedModels, kind: str | None = None, condition: str | None = None) -> Figure:
-    """Draw the models of one kind, the first by default, in the condition that feeds synthesis or another."""
-    return bode_figure(models.models(kind, condition))
+def identified_bode(models: IdentifiedModels, model: str | None = None, condition: str | None = None) -> Figure:
+    """Draw models of one kind, the first by default, in the condition that feeds synthesis or another."""
+    return bode_figure(models.models(model, condition))
+
+
+def identified_step(models: IdentifiedModels, model: str | None = None, condition: str | None = None) -> Figure:
+    """Draw the step responses of the same."""
+    return step_figure(models.models(model, condition))
 
 
 def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
@@ -32,17 +41,64 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
     rows, inputs = min(response.shape[2], DRAWING.states), min(response.shape[3], 2)
     values = (decibel(response), np.degrees(np.unwrap(np.angle(response), axis=1)))
     figure, axes = grid(rows, 2 * inputs, sharex=True)
-    for i, row in enumerate(axes):
-        for j, panel in enumerate(row):
-            lines = values[j % 2][:, :, i, j // 2]
-            lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
-            if nominal in models.unit_ids:
-                line = lines[models.index(nominal)]
-                panel.plot(freqs, line, color=Tone.INK.light, label=f"nominal, unit {nominal}")
-            frequency_axis(panel, freqs, "frequency (Hz)" if i == rows - 1 else "")
-            panel.locator_params(axis="y", nbins=4)
-        row[0].set_ylabel(short(models.lifting.names[i]))
+    for (i, j), panel in np.ndenumerate(axes):
+        lines = values[j % 2][:, :, i, j // 2]
+        lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
+        if nominal in models.unit_ids:
+            panel.plot(freqs, lines[models.index(nominal)], color=Tone.INK.light, label=f"nominal, unit {nominal}")
+        frequency_axis(panel, freqs, "frequency (Hz)" if i == rows - 1 else "")
+        panel.locator_params(axis="y", nbins=4)
+        panel.set_ylabel("" if j else short(models.lifting.names[i]))
     for j, panel in enumerate(axes[0]):
         panel.set_title(f"{words(models.inputs[j // 2])}:\n{'phase (°)' if j % 2 else 'magnitude (dB)'}")
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def step_figure(models: ModelSet) -> Figure:
+    """Draw the responses of the states of every unit to a unit step of every input, a column an input."""
+    time_s, responses = models.step_responses(DRAWING.points)
+    channels, inputs = models.channels[: models.lifting.n_states][: DRAWING.states], models.inputs[: DRAWING.states]
+    units = {c.name: readable_unit(c.unit) for c in models.channels}
+    figure, axes = grid(len(channels), len(inputs), sharex=True)
+    for (i, j), panel in np.ndenumerate(axes):
+        lines, colour = responses[..., i, j], model_look(models.name).colour
+        lines_of_units(panel, time_s, lines, colour, f"{len(lines)} units", models.unit_ids)
+        panel.margins(x=0)
+    for panel, name in zip(axes[0], inputs, strict=True):
+        panel.set_title(f"{short(name)}:\nstep of 1 {units.get(name, '')}")
+    label_rows(axes[:, 0], channels)
+    label_below(axes[-1], "time (s)")
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def residuals_figure(
+    models: IdentifiedModels, model: str | None = None, unit: str | None = None, condition: str | None = None
+) -> Figure:
+    """Draw the autocorrelation of one-step residuals, and their correlation with present and earlier inputs."""
+    from scipy.special import ndtri
+
+    key = shown_episode(models, unit, condition)
+    batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
+    chosen, signals = models.models(model, condition), (batch.states, batch.inputs, batch.parameters)
+    row, lifting = chosen.index(key.unit), chosen.lifting
+    residual = one_step_residual(lifting, chosen.A[row], chosen.B[row], *signals)[:, 0]
+    band = ndtri((1 + DRAWING.white) / 2) / np.sqrt(len(residual))
+    inputs = batch.inputs[-len(residual) :, 0].T[: DRAWING.states]
+    figure, axes = grid(min(lifting.n_states, DRAWING.states), 1 + len(inputs), sharex=True, sharey="col")
+    for values, name, panels in zip(residual.T, lifting.states, axes, strict=False):
+        for other, panel in zip((values, *inputs), panels, strict=True):
+            lines = correlation(values, other, DRAWING.lags)
+            panel.axhspan(
+                -band, band, color=Tone.GRID.light, lw=0, label=f"{100 * DRAWING.white:g} % band of white noise"
+            )
+            panel.vlines(
+                np.arange(len(lines)), 0, lines, color=model_look(chosen.name).colour, label=model_label(chosen.name)
+            )
+        panels[0].set_ylabel(short(name))
+    for panel, name in zip(axes[0], ("itself", *chosen.recorded_inputs), strict=False):
+        panel.set_title(f"residual with\n{short(name)}")
+    label_below(axes[-1], "lag (samples)")
     legend(figure, axes[0, 0])
     return figure

@@ -6,14 +6,16 @@ import numpy as np
 
 from ...core.arrays import AnyArray
 from ...core.errors import ConfigError
-from ...data.population import Population, Role
+from ...data.population import EpisodeKey, Population, Role
 from ...data.recording import some
 from ...evaluate.errors import error_spectrum
+from ...evaluate.validation import excitation
 from ...identify import PhaseCalibration
-from ..canvas import Figure, grid, label_below, legend, logarithmic, name_units, note, units_axis
+from ..canvas import Figure, frequency_axis, grid, label_below, legend, logarithmic, name_units, note, units_axis
 from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
-from ..theme import DRAWING, Tone
+from ..theme import DRAWING, HUES, Tone
+from .entries import short
 from .episodes import draw_lines, hide_times, label_rows, references, steady_stretches
 
 _RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light, weight=3, opacity=0.5)
@@ -44,11 +46,17 @@ def signals(run: RunFolder) -> tuple[Figure, str]:
     return figure, "The same unit in two conditions." if len(shown) == 2 else ""
 
 
-def population_figure(population: Population) -> Figure:
-    """Draw all channels of the first episode of a population, inputs in gold."""
-    if not population.episodes:
-        raise ConfigError("Plot: the population has no episodes; read some first.")
-    key = population.episodes[0]
+def episodes_of(population: Population, unit: str | None, condition: str | None) -> tuple[EpisodeKey, ...]:
+    """Return the episodes of a unit in a condition, the first ones by default."""
+    keys = population.keys(unit, condition)
+    if not keys:
+        raise ConfigError("Plot: the population has no such episodes; see its unit_ids and conditions.")
+    return population.keys(keys[0].unit, keys[0].condition)
+
+
+def population_figure(population: Population, unit: str | None = None, condition: str | None = None) -> Figure:
+    """Draw all channels of the first episode of a unit, inputs in gold."""
+    key = episodes_of(population, unit, condition)[0]
     values = population.read(key)
     figure, axes = grid(len(population.channels), 1, sharex=True)
     time_s = np.arange(len(values)) * population.sample_period_s
@@ -57,6 +65,29 @@ def population_figure(population: Population) -> Figure:
     label_rows(axes[:, 0], population.channels)
     axes[0, 0].set_title(episode_title(key))
     label_below(axes[-1], "time (s)")
+    return figure
+
+
+def excitation_figure(population: Population, unit: str | None = None, condition: str | None = None) -> Figure:
+    """Draw spectra of the inputs and their coherence with every state, over the episodes of a unit."""
+    keys, states = episodes_of(population, unit, condition), len(population.states)
+    inputs = population.channels[states:][: DRAWING.states]
+    if not inputs:
+        raise ConfigError("Plot of the excitation: the population has no inputs; declare some.")
+    freqs, power, coherence = excitation(population, keys, DRAWING.segment, DRAWING.averages)
+    figure, axes = grid(len(inputs), 2, sharex=True)
+    for i, (channel, (left, right)) in enumerate(zip(inputs, axes, strict=True), states):
+        left.plot(freqs[1:], power[i, 1:], color=Tone.GOLD.light)
+        logarithmic(left)
+        left.set_ylabel(f"{short(channel.name)}\n({squared(channel.unit)}/Hz)")
+        for name, line, tone in zip(population.states, coherence[i], HUES, strict=False):
+            right.plot(freqs[1:], line[1:], color=tone.light, label=words(name))
+        right.set_ylim(0, 1.05)
+        frequency_axis(left, freqs, "")
+    axes[0, 0].set_title(f"PSD, {len(keys)} episodes of unit {keys[0].unit}")
+    axes[0, 1].set_title("coherence with states")
+    label_below(axes[-1])
+    legend(figure, axes[0, 1])
     return figure
 
 

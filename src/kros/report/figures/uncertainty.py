@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ...core.arrays import AnyArray
-from ...core.errors import ConfigError
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, residual, sigma_max
 from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
@@ -178,10 +177,9 @@ def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
     return entries_figure(run.others, names, alarm=unit), text + f"all units but {unit}."
 
 
-def sets_figure(models: UncertainModels, kind: str | None = None) -> Figure:
+def sets_figure(models: UncertainModels, model: str | None = None) -> Figure:
     """Draw the weights of one kind of model, the first by default."""
-    name = kind or next(iter(models.sets))
-    if name not in models.sets:
-        raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(models.sets)}.")
-    model, identified = models.sets[name], models.models.models(name)
-    return weights_figure({name: (model, identified, residuals_beside_weights(identified, model))})
+    name = model or next(iter(models.sets))
+    identified = models.models.models(name)
+    uncertain = models.sets[name]
+    return weights_figure({name: (uncertain, identified, residuals_beside_weights(identified, uncertain))})

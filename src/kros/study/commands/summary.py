@@ -16,7 +16,6 @@ from ...report.compare import comparison, lines, sections
 from ...report.error_tables import ErrorCell
 from ...report.facts import Facts
 from ...report.html import filled
-from ...report.verdict import judge
 from ..config import Stage
 from ..engine.store import METRICS, open_finished
 from ..pipeline import RunResult
@@ -48,18 +47,6 @@ def _version(name: str, otherwise: str) -> str:
         return otherwise
 
 
-def summary_lines(result: RunResult) -> list[str]:
-    """Return the verdict, three numbers, and where the report is."""
-    facts, report = Facts(result.metrics), result.folder / "report.html"
-    if not facts.deployed:
-        units = f"{facts.study['units']} units: no observer has been designed yet"
-        return [units, *(f"check: {alert}" for alert in facts.study.get("alerts", ())), f"results: {result.folder}"]
-    verdict = judge(facts)
-    numbers = [f"{n.label} {n.value} {n.unit} ({n.notes[-1]})" for n in verdict.numbers]
-    lines = [f"{verdict.status.value}: {verdict.sentence}", *(["; ".join(numbers)] if numbers else [])]
-    return [*lines, f"report: {report}" if report.exists() else f"results: {result.folder}"]
-
-
 def ranking(facts: Facts) -> list[str]:
     """Return one line an observer, the smallest error of the hidden channels first."""
     table = facts.table
@@ -89,7 +76,7 @@ def list_run(run: Path) -> list[str]:
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
         if store.path(METRICS).exists():
             result = RunResult(store.folder, store.metrics())
-            return lines + ranking(Facts(result.metrics)) + summary_lines(result)
+            return lines + ranking(Facts(result.metrics)) + result.summary().splitlines()[1:]
         if store.record(Stage.SYNTHESIZE) is not None:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]
             lines += [f"observers: {', '.join(names)}"]

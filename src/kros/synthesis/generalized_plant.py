@@ -15,7 +15,7 @@ import numpy as np
 from ..core.arrays import AnyArray, frozen
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, real_array, sampling_period
-from ..core.rounding import SINGULAR
+from .problem.interconnect import interconnect
 
 _MATRICES = ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21", "D22")
 
@@ -160,24 +160,15 @@ class GeneralizedPlant:
             When sizes or sampling periods differ, or the loop is not well posed (``I - D22 D^c`` singular).
         """
         K = StateSpace.of(controller)
-        _, _, n_u, _, n_y = self.sizes
+        _, n_w, n_u, n_z, n_y = self.sizes
         if (K.n_outputs, K.n_inputs) != (n_u, n_y) or K.dt != self.dt or K.batch_shape:
             size = f"{K.n_outputs} x {K.n_inputs} at {K.dt} s"
             raise DimensionError(
                 f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {size}."
             )
-        loop = np.eye(n_y) - self.D22 @ K.D
-        if n_y and np.linalg.cond(loop) > SINGULAR:
-            raise DimensionError("Closing the loop: I - D22 D^c is singular; use a strictly proper controller.")
-        # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
-        solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
-        y_x, y_w = solved[:, : self.A.shape[0] + K.n_states], solved[:, self.A.shape[0] + K.n_states :]
-        u_x = K.D @ y_x + np.hstack([np.zeros((n_u, self.A.shape[0])), K.C])
-        u_w = K.D @ y_w
-        A = np.vstack([np.hstack([self.A, np.zeros((self.A.shape[0], K.n_states))]) + self.B2 @ u_x, K.B @ y_x])
-        A[self.A.shape[0] :, self.A.shape[0] :] += K.A
-        C = np.hstack([self.C1, np.zeros((self.C1.shape[0], K.n_states))]) + self.D12 @ u_x
-        return StateSpace(A, np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), C, self.D11 + self.D12 @ u_w, self.dt)
+        inputs, outputs = np.eye(n_w + n_u), np.eye(n_z + n_y)
+        wires = {"P": {"w": inputs[:, :n_w], "K": inputs[:, n_w:]}, "K": {"P": outputs[n_z:]}}
+        return interconnect({"P": self.open_loop(), "K": K}, wires, {"w": n_w}, {"z": {"P": outputs[:n_z]}})
 
 
 def split(system: StateSpace, n_w: int, n_z: int, **parts: int | None) -> GeneralizedPlant:

@@ -1,6 +1,6 @@
 r"""Generalized plants of the observer problem, in scaled coordinates.
 
-For every form, with the perturbed plant in it (`uncertainty_location`) and the observer (18)-(21) beside it::
+For every form, with the perturbed plant in it (`observer_problem`) and the observer (18)-(21) beside it::
 
     w1 -> W_u -+-> s                       s, or x = G (s + [W_L w2]) + [W_L w2] -> W_R -> z2 ... Delta ... w2
                |                                   (what an inverse form sees contains W_L w2)

@@ -35,14 +35,11 @@ _ACCURACY = 1e-5  # of the quadrature, relative; a hundred times as much for wha
 
 def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) -> AnyArray:
     """Certified worst-case power density of ``W_p e``, shape (f,), for the error system from (d, r, n, v[, s])."""
-    m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response, T, certain, noise = _responses(problem, errors, freqs_hz)
     uncertain = uncertain_ball(problem, freqs_hz).bound(T, certain)
-    if problem.remainder_left is not None and problem.remainder_right is not None:
-        left = response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz)
-        uncertain = uncertain + spread(
-            left, (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz)
-        )
+    if problem.remainder is not None:
+        left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
+        uncertain = uncertain + spread(response @ left, right)
     return uncertain**2 + noise
 
 
@@ -57,14 +54,13 @@ def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Any
 def _responses(
     problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray
 ) -> tuple[AnyArray, AnyArray, AnyArray | float, AnyArray]:
-    """Return the response of an error system, T, ``T_s W_u``, and the density of noise."""
-    white, direct = problem.nominal.n_inputs + problem.nominal.n_states, problem.error_inputs
+    """Return the response of an error system to r, T, ``T_s W_u``, and the density of noise."""
+    m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response = errors.frequency_response(freqs_hz)
-    T = response[..., problem.uncertainty_input] @ problem.W_L.frequency_response(freqs_hz)
-    certain: AnyArray | float = 0.0
-    if errors.n_inputs > direct:
-        certain = response[..., direct:] @ problem.input_weight.frequency_response(freqs_hz)
-    return response, T, certain, np.sum(np.abs(response[..., white:direct]) ** 2, axis=(-2, -1))
+    d, r, noise, s = np.split(response, [m, m + n, m + 2 * n + len(problem.C)], axis=-1)
+    T = (d if problem.location.at_input else r) @ problem.W_L.frequency_response(freqs_hz)
+    certain = s @ problem.input_weight.frequency_response(freqs_hz) if s.size else 0.0
+    return r, T, certain, np.sum(np.abs(noise) ** 2, axis=(-2, -1))
 
 
 def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, float]:

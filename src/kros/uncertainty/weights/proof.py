@@ -30,7 +30,7 @@ from ...core.arrays import AnyArray, frozen
 from ...core.frequency import nyquist_hz
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ..forms import OUTPUT_SIDE, Form, change_of, loop_of, residual_of
+from ..forms import Form, change_of, loop_of, residual_of
 from ..settings import PROOF
 
 Ratio = Callable[[AnyArray], AnyArray]
@@ -254,7 +254,7 @@ def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
     """Tell whether a form rebuilds every regular unit of a shape exactly."""
     if form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
         return form is Form.ADDITIVE or n_outputs == n_inputs
-    return n_outputs >= n_inputs if form in OUTPUT_SIDE else n_outputs <= n_inputs
+    return n_outputs <= n_inputs if form.at_input else n_outputs >= n_inputs
 
 
 def _remainder(form: Form, G: Descriptor, Gp: Descriptor, E: Descriptor) -> Descriptor:
@@ -263,7 +263,7 @@ def _remainder(form: Form, G: Descriptor, Gp: Descriptor, E: Descriptor) -> Desc
         return (Gp - G) - change_of(form, G, E)
     loop = loop_of(form, G, E)
     inverse = (Descriptor.identity(len(loop.D)) - loop).inverse()
-    return Gp - (inverse @ G if form in OUTPUT_SIDE else G @ inverse)
+    return Gp - (G @ inverse if form.at_input else inverse @ G)
 
 
 def invert(system: StateSpace) -> StateSpace:

@@ -12,8 +12,6 @@ which is quadratic below `level`; a power above one flattens the residual's peak
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ...core.arrays import AnyArray, Array, frozen
@@ -37,10 +35,6 @@ class ResponsePrior:
     power: int
     weight: float = 1.0
     points: int = 100
-
-    def scaled(self, weight: float) -> ResponsePrior:
-        """Return the same prior with another weight."""
-        return replace(self, weight=weight)
 
     def residual(self, V: Array) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return E (unit, frequency, m, m) of models V, ``G^+ Phi`` and ``T^T Z (I - E)``."""

@@ -71,6 +71,11 @@ class Form(StrEnum):
         return inputs if self.at_input else outputs, inputs if self.sees_input else outputs
 
 
+def evenly(count: int, most: int) -> AnyArray:
+    """Return at most so many rows, spread evenly over all."""
+    return np.unique(np.linspace(0, count - 1, most).round().astype(int))
+
+
 def as_form(form: Form | str) -> Form:
     """Return the form of a name, or raise a `ConfigError`."""
     return member(Form, form, "Uncertainty form")

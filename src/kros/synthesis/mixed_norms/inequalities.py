@@ -74,7 +74,7 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     L = K.B - plant.B2 @ K.D  # predictor gain: e+ = (A - L C2) e + ...
     A = np.block([[plant.A - L @ plant.C2, np.zeros((n, n))], [K.B @ plant.C2, K.A + K.B @ plant.C2]])
     P = gramian(A, np.vstack([plant.B1 - L @ plant.D21, K.B @ plant.D21]), plant.dt)
-    E, X = P[:n, :n], P[:n, :n] + P[:n, n:] + P[n:, :n] + P[n:, n:]
+    E, X = P[:n, :n], P.reshape(2, n, 2, n).sum(axis=(0, 2))
     X = X + _KNOWN**2 * np.diag(np.where(np.diag(X) > 0, 0.0, np.diag(X).max(initial=1.0)))
     E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > EPS**2 * np.diag(X), 0.0, np.diag(X)))
     T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)

@@ -105,7 +105,6 @@ def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> 
         worst_case_h2=value,
         quadrature_error=error,
         spectral_radius=loop.largest_pole(),
-        solver="riccati",
     )
 
 
@@ -127,20 +126,17 @@ def circle_mean(
 ) -> tuple[float, float]:
     """Return mean and error over the circle of an even density of angles (k,); `centers` are log poles."""
     edges = _edges(centers)
-    left, right = edges[:-1], edges[1:]
-    values, errors = _panels(density, left, right)
-    while errors.sum() > rtol * values.sum():
-        if len(values) > max_panels:
-            error = f"relative error {errors.sum() / values.sum():.2g} after {len(values)} panels, above {rtol:.2g}"
-            raise SynthesisError(f"Integrating the density: {error}; poles are extremely close to the unit circle.")
-        split = errors > min(0.5 * errors.max(), rtol * values.sum() / len(values))
-        middle = np.where(left[split] > 0, np.sqrt(left[split] * right[split]), right[split] / 4)
-        new_left = np.concatenate([left[split], middle])
-        new_right = np.concatenate([middle, right[split]])
-        new_values, new_errors = _panels(density, new_left, new_right)
-        left, right = np.concatenate([left[~split], new_left]), np.concatenate([right[~split], new_right])
-        values, errors = np.concatenate([values[~split], new_values]), np.concatenate([errors[~split], new_errors])
-    return float(values.sum() / np.pi), float(errors.sum() / np.pi)
+    panels = _panels(density, edges[:-1], edges[1:])
+    while (error := panels[3].sum()) > rtol * (total := panels[2].sum()):
+        if len(panels.T) > max_panels:
+            text = f"relative error {error / total:.2g} after {len(panels.T)} panels, above {rtol:.2g}"
+            raise SynthesisError(f"Integrating the density: {text}; poles are extremely close to the unit circle.")
+        split = panels[3] > min(0.5 * panels[3].max(), rtol * total / len(panels.T))
+        left, right, _, _ = panels[:, split]
+        middle = np.where(left > 0, np.sqrt(left * right), right / 4)
+        halves = _panels(density, np.concatenate([left, middle]), np.concatenate([middle, right]))
+        panels = np.hstack([panels[:, ~split], halves])
+    return float(panels[2].sum() / np.pi), float(error / np.pi)
 
 
 def _edges(centers: AnyArray) -> AnyArray:
@@ -156,8 +152,8 @@ def _edges(centers: AnyArray) -> AnyArray:
     return np.concatenate([[0.0], edges[apart]])
 
 
-def _panels(density: Callable[[AnyArray], AnyArray], left: AnyArray, right: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Both rules on every panel; logarithmic inside, linear in the panel that touches DC."""
+def _panels(density: Callable[[AnyArray], AnyArray], left: AnyArray, right: AnyArray) -> AnyArray:
+    """Return ends, integral and its error of every panel; logarithmic inside, linear in the one that touches DC."""
     linear = left <= 0
     log_left = np.log(np.where(linear, 1.0, left))
     log_right = np.where(linear, 0.0, np.log(right))
@@ -169,4 +165,4 @@ def _panels(density: Callable[[AnyArray], AnyArray], left: AnyArray, right: AnyA
         raise SynthesisError("Integrating the density: it is not finite; is the set well posed and the loop stable?")
     weighted = np.where(linear[:, None], values * right[:, None] / 2, values * angles * half[:, None])
     integral = weighted[:, : len(_NODES)] @ _WEIGHTS
-    return integral, np.abs(integral - weighted[:, len(_NODES) :] @ _ROUGH_WEIGHTS)
+    return np.stack([left, right, integral, np.abs(integral - weighted[:, len(_NODES) :] @ _ROUGH_WEIGHTS)])

@@ -22,7 +22,6 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -105,9 +104,9 @@ def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis
     if radius >= 1:
         loop = f"the loop has spectral radius {radius:.9g}"
         raise SynthesisError(f"Worst-case H2 synthesis: {loop}; add noise, or lower the order of the weights.")
-    facts: dict[str, Any] = {"injection": problem.injection, "spectral_radius": radius, "solver": "riccati"}
     notes = ("A design alone, without certificate.",)
-    return Synthesis("worst_case_h2", controller, Status.INACCURATE, **facts, notes=notes)
+    alone = Synthesis("worst_case_h2", controller, Status.INACCURATE, problem.injection, notes=notes)
+    return replace(alone, spectral_radius=radius)
 
 
 def design(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpace:

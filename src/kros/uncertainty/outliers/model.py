@@ -30,7 +30,7 @@ import numpy as np
 from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.artifacts import Storable
 from ...core.errors import ConfigError, DataError
-from ..forms import Form, as_form, check_responses
+from ..forms import Form, as_form, check_responses, evenly
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
 from .score import Comparison, OutlierScore, Status
@@ -189,7 +189,7 @@ def score_outliers(
     form, rate = as_form(form), float(false_alarm_rate)
     if not 0 < rate < 1:
         raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.01 is usual.")
-    rows = scored_rows(len(freqs))
+    rows = evenly(len(freqs), OUTLIER.frequencies)
     freqs, G = freqs[rows], G[:, rows]
     scales = balance(G)
     G = G / scales[0][:, None] * scales[1]
@@ -200,11 +200,6 @@ def score_outliers(
     scores = comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist())))
     names = tuple(ids[k] for k in inliers)
     return OutlierModel(form, names, freqs, G[inliers], *scales, scores, parts.threshold_db, rate)
-
-
-def scored_rows(count: int) -> AnyArray:
-    """Return the rows of frequencies that scores look at, where they are given more."""
-    return np.unique(np.linspace(0, count - 1, OUTLIER.frequencies).round().astype(int))
 
 
 def _population(

@@ -22,8 +22,9 @@ from ...core.work import Work
 from ...identify import Factor, ModelSet, combine
 from ...identify.factors import lifted_factor
 from ...identify.identified import EpisodeFactors, IdentifiedModels
+from ..forms import evenly
 from ..settings import OUTLIER, QuantifySettings
-from .model import OutlierModel, score_outliers, scored_rows
+from .model import OutlierModel, score_outliers
 from .score import OutlierScore, Status
 from .tail import LEAST_SCORES
 
@@ -56,7 +57,7 @@ def score_condition(
 ) -> tuple[OutlierModel, list[int]]:
     """Score all units in one condition; with every unit's number of samples."""
     freqs = models.frequencies(settings.n_freqs)
-    freqs = freqs[scored_rows(len(freqs))]
+    freqs = freqs[evenly(len(freqs), OUTLIER.frequencies)]
     recorded = Recorded.of(factors, models, freqs)
     evidence = list(recorded.units.values())
     responses, ids = recorded.response(evidence), models.unit_ids

@@ -202,12 +202,10 @@ def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec
 Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]
 
 
-def calibrate(
-    population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work | None = None
-) -> PhaseCalibration:
+def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work) -> PhaseCalibration:
     """Calibrate all units on training episodes; one that cannot be calibrated is left out, its reason in the log."""
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
-    recalled = (work or Work()).recall("calibrate", segments_of, tasks, [_mark(facts, t) for t in tasks], list[Segment])
+    recalled = work.recall("calibrate", segments_of, tasks, [_mark(facts, t) for t in tasks], list[Segment])
     units: dict[str, UnitPhase] = {}
     for unit, segments in zip(facts.groups, recalled, strict=True):
         try:

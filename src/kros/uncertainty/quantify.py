@@ -153,7 +153,7 @@ def quantify(
     if isinstance(models, IdentifiedModels):
         given = {} if freqs_hz is None else {"freqs_hz": freqs_hz}
         settings = QuantifySettings.of({"form": getattr(form, "value", form)} | given | options, "Quantify")
-        return _quantify_population(models, settings, work)
+        return _quantify_population(models, settings, work or Work())
     if isinstance(models, Mapping):
         options["unit_ids"], models = tuple(models), list(models.values())
     if isinstance(models, list | tuple) and models and all(hasattr(model, "frdata") for model in models):
@@ -164,7 +164,7 @@ def quantify(
     return bound(models, as_form(form), freqs_hz, Options.of(options, "Quantify"))
 
 
-def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work | None) -> UncertainModels:
+def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work) -> UncertainModels:
     """Score outliers, choose the nominal of the first kind of models, and bound every kind around it."""
     outliers, scores = score_population(models, settings, work)
     first = models.models()
@@ -178,7 +178,7 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
     options = Options(unit_ids=tuple(units), nominal=nominal, **same)
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
     tasks = [partial(bound_systems, *one, options) for one in every]
-    sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
+    sets = dict(zip(models.kinds, work.run("quantify", tasks), strict=True))
     worst_off = worst_off_nominal(first, sets[models.kinds[0]])
     return UncertainModels(models, nominal, worst_off, sets, tuple(scores), outliers)
 

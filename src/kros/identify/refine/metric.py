@@ -19,9 +19,9 @@ from ...core.linalg import adjoint, entries_first, multiply, sigma_max_first
 from .minimax import smallest_largest
 
 
-def unit_circle(points: int, decades: int = 6) -> AnyArray:
-    """Return ``exp(j omega)`` at logarithmic frequencies, some decades below Nyquist up to it."""
-    return np.exp(1j * np.pi * np.logspace(-decades, 0, points))
+def unit_circle(points: int) -> AnyArray:
+    """Return ``exp(j omega)`` at logarithmic frequencies, six decades below Nyquist up to it."""
+    return np.exp(1j * np.pi * np.logspace(-6, 0, points))
 
 
 @frozen

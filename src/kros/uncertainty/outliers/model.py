@@ -30,6 +30,7 @@ import numpy as np
 from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.artifacts import Storable
 from ...core.errors import ConfigError, DataError
+from ...core.frequency import check_grid
 from ..forms import Form, as_form, check_responses, evenly
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
@@ -206,10 +207,10 @@ def _population(
     responses: Any, unit_ids: tuple[str, ...] | None, freqs_hz: Any
 ) -> tuple[AnyArray, tuple[str, ...], AnyArray]:
     """Checked responses, names and frequencies."""
-    freqs = np.asarray(freqs_hz, float)
+    freqs = check_grid(freqs_hz, None)
     G = check_responses(responses, unit_ids, freqs)
     if len(G) < LEAST_SCORES:
         raise DataError(f"Outlier scores: need at least {LEAST_SCORES} units, found {len(G)}.")
-    if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
-        raise ConfigError(f"Outlier scores: need increasing positive frequencies, found {freqs[:3]}.")
+    if freqs[0] == 0:
+        raise ConfigError("Outlier scores: need frequencies above zero.")
     return G, tuple(unit_ids or map(str, range(len(G)))), freqs

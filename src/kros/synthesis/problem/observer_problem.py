@@ -40,6 +40,7 @@ A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -299,8 +300,8 @@ class ObserverProblem:
         """
         A, B, C, W_p = self.scaled
         n, m, q, eye, dt = len(A), B.shape[1], len(C), np.eye, self.nominal.dt
-        sizes = np.diag([*self.noise, *self.output_scale, *self.input_scale])
-        filters = gain(np.diag(1 / self.output_scale), dt) @ estimate @ gain(sizes, dt)
+        sizes = np.concatenate([self.noise, self.output_scale, self.input_scale])
+        filters = _scaled(estimate, 1 / self.output_scale, sizes)
         truth = np.vstack([C, eye(n), np.zeros((m, n))])
         columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
         plant = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt)
@@ -318,10 +319,15 @@ class ObserverProblem:
 
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
-        (correction, noise), dt = self._scales, self.nominal.dt
-        return gain(np.diag(1 / correction), dt) @ controller @ gain(np.diag(noise), dt)
+        correction, noise = self._scales
+        return _scaled(controller, 1 / correction, noise)
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
-        (correction, noise), dt = self._scales, self.nominal.dt
-        return gain(np.diag(correction), dt) @ controller @ gain(np.diag(1 / noise), dt)
+        correction, noise = self._scales
+        return _scaled(controller, correction, 1 / noise)
+
+
+def _scaled(system: StateSpace, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
+    """Return a system with outputs and inputs multiplied."""
+    return replace(system, B=system.B * inputs, C=outputs[:, None] * system.C, D=outputs[:, None] * system.D * inputs)

@@ -206,11 +206,6 @@ class Ranges:
         peak = np.where(peak > 0, peak, 1.0)
         return cls(peak[:n_lifted], peak[n_lifted:])
 
-    @property
-    def inverse(self) -> Ranges:
-        """Ranges that lead back."""
-        return Ranges(1 / self.outputs, 1 / self.inputs)
-
     def sizes(self, lifting: Lifting, recorded: tuple[str, ...]) -> dict[str, float]:
         """Return the ranges by name: of states, lifted functions, recorded inputs and functions of these."""
         names = (*lifting.names, *recorded, *lifting.input_functions)
@@ -223,7 +218,7 @@ class Ranges:
 
     def restore(self, models: KoopmanMatrices) -> KoopmanMatrices:
         """Return models of the channels as recorded from those of channels divided by the ranges."""
-        return self.inverse.normalise(models)
+        return Ranges(1 / self.outputs, 1 / self.inputs).normalise(models)
 
     def triangles(self, R: Array) -> Array:
         """Return factors of ``[Psi | Theta_plus]`` of channels divided by the ranges."""

@@ -82,6 +82,7 @@ def residual_h2(
         gap_percent=gap,
         spectral_radius=shaped.error_system(K).largest_pole(),
         solve_s=time.perf_counter() - start,
+        solver="riccati",
         notes=(note, *notes),
     )
 

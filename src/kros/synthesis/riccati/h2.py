@@ -88,6 +88,7 @@ def h2(plant: GeneralizedPlant) -> Synthesis:
         gap_percent=100 * (norm / lower - 1) if lower > rounding else 0.0,
         spectral_radius=closed.largest_pole(),
         solve_s=elapsed,
+        solver="riccati",
     )
 
 

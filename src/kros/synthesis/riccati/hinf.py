@@ -139,6 +139,7 @@ def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, e
         gap_percent=gap,
         spectral_radius=closed.largest_pole(),
         solve_s=elapsed,
+        solver="riccati",
         notes=notes,
     )
 

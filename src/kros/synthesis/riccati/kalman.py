@@ -89,6 +89,7 @@ def kalman(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, dt: float = 1
         h2_norm=norm,
         spectral_radius=radius,
         solve_s=elapsed,
+        solver="riccati",
     )
 
 

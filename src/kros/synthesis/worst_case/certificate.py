@@ -105,6 +105,7 @@ def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> 
         worst_case_h2=value,
         quadrature_error=error,
         spectral_radius=loop.largest_pole(),
+        solver="riccati",
     )
 
 

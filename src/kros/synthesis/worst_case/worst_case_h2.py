@@ -106,7 +106,7 @@ def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis
         raise SynthesisError(f"Worst-case H2 synthesis: {loop}; add noise, or lower the order of the weights.")
     notes = ("A design alone, without certificate.",)
     alone = Synthesis("worst_case_h2", controller, Status.INACCURATE, problem.injection, notes=notes)
-    return replace(alone, spectral_radius=radius)
+    return replace(alone, spectral_radius=radius, solver="riccati")
 
 
 def design(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpace:

@@ -16,7 +16,7 @@ import numpy as np
 from ..core.arrays import AnyArray, frozen
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, real_array, sampling_period
-from .problem.interconnect import interconnect
+from ..core.rounding import SINGULAR
 
 _MATRICES = ("A", "B1", "B2", "C1", "D11", "D12", "C2", "D21", "D22")  # row by row
 
@@ -151,15 +151,24 @@ class GeneralizedPlant:
             When sizes or sampling periods differ, or the loop is not well posed (``I - D22 D^c`` singular).
         """
         K = StateSpace.of(controller)
-        _, n_w, n_u, n_z, n_y = self.sizes
+        n, _, n_u, _, n_y = self.sizes
         if (K.n_outputs, K.n_inputs) != (n_u, n_y) or K.dt != self.dt or K.batch_shape:
             size = f"{K.n_outputs} x {K.n_inputs} at {K.dt} s"
             raise DimensionError(
                 f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {size}."
             )
-        inputs, outputs = np.eye(n_w + n_u), np.eye(n_z + n_y)
-        wires = {"P": {"w": inputs[:, :n_w], "K": inputs[:, n_w:]}, "K": {"P": outputs[n_z:]}}
-        return interconnect({"P": self.open_loop(), "K": K}, wires, {"w": n_w}, {"z": {"P": outputs[:n_z]}})
+        loop = np.eye(n_y) - self.D22 @ K.D
+        if n_y and np.linalg.cond(loop) > SINGULAR:
+            raise DimensionError("Closing the loop: I - D22 D^c is singular; use a strictly proper controller.")
+        # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y; large gains stay out of what is inverted
+        solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
+        y_x, y_w = np.split(solved, [n + K.n_states], axis=1)
+        u_x, u_w = K.D @ y_x + np.hstack([np.zeros((n_u, n)), K.C]), K.D @ y_w
+        more = (0, 0), (0, K.n_states)
+        A = np.vstack([np.pad(self.A, more) + self.B2 @ u_x, K.B @ y_x])
+        A[n:, n:] += K.A
+        B, C = np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), np.pad(self.C1, more) + self.D12 @ u_x
+        return StateSpace(A, B, C, self.D11 + self.D12 @ u_w, self.dt)
 
 
 def split(system: StateSpace, n_w: int, n_z: int, **parts: int | None) -> GeneralizedPlant:

@@ -200,7 +200,7 @@ class Source:
 
     def factor(self, name: str) -> str | None:
         """Return the literal of a channel's factor; None where it is one."""
-        return next(iter(self.literals(recorded_factors(self.observer, [name]).tolist())), None)
+        return next(iter(self.literals([self.factors()[name]])), None)
 
     def symbol(self, name: str) -> str:
         """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""

@@ -99,7 +99,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     problem = _around(problem, one_model, common)
     path, scores, peaks = _path(data, problem, common)
     choice = _choose(scores, peaks, options)
-    strength = _falling(options)[choice]
+    strength = options.strengths[choice]
     log.info("prior of strength %g chosen, held-out score %.4g", strength, scores[choice])
     final = replace(problem, segments=segments).with_prior(strength)
     solution = _fit(final, path[choice], replace(options.search, iterations=options.final_iterations))
@@ -116,11 +116,6 @@ def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Ar
     return replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
 
 
-def _falling(options: RefineOptions) -> list[float]:
-    """Return the strengths of the prior, strongest first."""
-    return sorted(options.strengths, reverse=True)
-
-
 def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], Array, Array]:
     """Fit all units at falling strengths, until weaker ones bring nothing; return parameters, scores and peaks."""
     options = problem.options
@@ -128,7 +123,7 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
     path: list[Array] = []
     rows: list[tuple[float, float]] = []
-    for strength in _falling(options):
+    for strength in options.strengths:
         V = _fit(problem.with_prior(strength), V, search).V
         path.append(V)
         rows.append(trade_off(data, problem, V))

@@ -24,7 +24,6 @@ from itertools import islice
 import numpy as np
 
 from ...core.arrays import AnyArray, frozen
-from ...core.linalg import squared
 from ...core.rounding import TINY
 from ..settings import FIT
 from .cover import Cover
@@ -184,6 +183,10 @@ class _State:
 
 def _singular(matrices: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return log singular values, (n, rank), and squared moduli of the entries of their vectors, left then right."""
-    left, sigma, right = np.linalg.svd(matrices, full_matrices=False)
-    shares = np.concatenate([np.swapaxes(left, 1, 2), right], axis=2)
-    return np.log(np.maximum(sigma, TINY)), squared(shares)
+    adjoint = np.conj(np.swapaxes(matrices, 1, 2))
+    wide = matrices.shape[1] <= matrices.shape[2]
+    squares, short = np.linalg.eigh(matrices @ adjoint if wide else adjoint @ matrices)
+    long = np.abs((adjoint if wide else matrices) @ short) ** 2
+    long /= np.maximum(long.sum(axis=1, keepdims=True), TINY)
+    parts = (np.abs(short) ** 2, long) if wide else (long, np.abs(short) ** 2)
+    return np.log(np.maximum(squares, TINY)) / 2, np.swapaxes(np.concatenate(parts, axis=1), 1, 2)

@@ -97,8 +97,8 @@ def export_fmu(
 def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
     """Return the files that make C source an FMU."""
     observer, name = source.observer, source.name
-    declared = {c: recorded_channel(observer, c).unit for c in (*observer.recorded, *observer.inputs)}
-    units = {c: plain(unit) for c, unit in declared.items() if unit}
+    names = (*observer.recorded, *observer.inputs)
+    units = {c: plain(unit) for c in names if (unit := recorded_channel(observer, c).unit)}
     estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
     more = {
         "version": version("kros"),

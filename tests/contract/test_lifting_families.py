@@ -10,7 +10,7 @@ from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting, radial
-from kros.lifting.program import c_code
+from kros.lifting.program import Precision, c_code
 
 BOX = {"position": (-1.5, 1.2), "velocity": (0.1, 2.0), "voltage": (-3.0, 3.0)}
 PHASE = (0.2, 0.9)
@@ -49,7 +49,9 @@ def test_c_computes_what_numpy_does(lifting, tmp_path):
         else:
             lines.append(f"const double {name}={slot};(void){name};")
     expressions = [formula.expression for formula in lifting.formulas + lifting.input_formulas]
-    written = [c_code(tree, lambda name: f"{name}[0]" if name in pointers else name) for tree in expressions]
+    written = [
+        c_code(tree, lambda name: f"{name}[0]" if name in pointers else name, Precision()) for tree in expressions
+    ]
     lines += [f'printf("%.17g\\n",(double)({expression}));' for expression in written]
     width = windows.shape[1] + 2
     source = (

@@ -17,7 +17,6 @@ from kros.evaluate.closed_loop.small_gain import Blocks, peak, worst_gain
 from kros.observer import Observer, Runtime
 from kros.synthesis import ObserverProblem
 from kros.synthesis.problem.interconnect import interconnect
-from kros.synthesis.problem.uncertainty_location import LOCATIONS
 from kros.uncertainty import Form, rebuild
 
 DT = 0.1
@@ -88,7 +87,7 @@ def stable(rng: np.random.Generator, p: int, m: int, size: float) -> StateSpace:
 
 def matrix_loop(form: Form, remainder: bool) -> LinearLoop:
     """Two states, one input, an estimator that corrects, a controller with a state, dynamic weights."""
-    rng, place = np.random.default_rng(3), LOCATIONS[form]
+    rng, place = np.random.default_rng(3), Form(form)
     (rows, columns), scales = place.sizes(2, 1), ([1.0], [1.0, 1.0], [1.0])
     weights = stable(rng, rows, rows, 0.1), stable(rng, columns, columns, 1.0)
     more = {"remainder_left": stable(rng, 2, 2, 0.1), "remainder_right": stable(rng, 1, 1, 1.0)} if remainder else {}

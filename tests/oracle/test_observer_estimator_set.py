@@ -21,7 +21,6 @@ from kros.observer.estimator.certificate import linear_estimate, outside_percent
 from kros.observer.estimator.channels import products, without_limits
 from kros.observer.sensor import Sensor
 from kros.synthesis import ObserverProblem
-from kros.synthesis.problem.uncertainty_location import LOCATIONS
 from kros.synthesis.worst_case.certificate import attained, certify_errors, density
 from kros.uncertainty import Form, rebuild
 
@@ -37,7 +36,7 @@ def found():
 
 def problem(form, size=0.3, seed=0, dynamic=False, **changes):
     """Return a problem around NOMINAL; weights are static or have a pole each."""
-    rng, location = np.random.default_rng(seed), LOCATIONS[Form(form)]
+    rng, location = np.random.default_rng(seed), Form(form)
     rows, columns = location.sizes(3, 1)
 
     def weight(p, m):

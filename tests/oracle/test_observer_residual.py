@@ -84,7 +84,7 @@ def test_known_shaping_filter_gives_its_optimum():
     truth = autoregression()
     reference, best = optimum(truth)
     found = residual_h2(
-        ResidualProblem(A, C, spectrum(truth)[None], NOISE, SCALE, DT), Basis(2, ()), tolerance_percent=0
+        ResidualProblem(A, C, spectrum(truth)[None], NOISE, SCALE, DT, Basis(2, ())), tolerance_percent=0
     )
     assert (found.status, found.injection, found.method) == (Status.OPTIMAL, Injection.STATE, "residual_h2")
     assert found.h2_norm == pytest.approx(best, rel=1e-5)

@@ -8,7 +8,6 @@ from members import perturbed
 from kros.core import StateSpace, block_diagonal, gain, hinf_norm
 from kros.synthesis import Injection, ObserverProblem, worst_case_h2
 from kros.synthesis.problem.plants import generalized_plant
-from kros.synthesis.problem.uncertainty_location import LOCATIONS
 from kros.synthesis.worst_case.certificate import certify, density
 from kros.uncertainty import Form, rebuild, residual
 
@@ -43,7 +42,7 @@ def problem(form, seed=0, structure="full", injection=Injection.STATE, remainder
     A = rng.standard_normal((N, N))
     A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
     nominal = StateSpace(A, rng.standard_normal((N, M)), np.eye(N), np.zeros((N, M)), DT)
-    rows, columns = LOCATIONS[Form(form)].sizes(N, M)
+    rows, columns = Form(form).sizes(N, M)
     parts = {
         "nominal": nominal,
         "C": np.eye(N)[:1],
@@ -137,7 +136,7 @@ def test_plant_is_minimal(form):
         for pole in np.linalg.eigvals(system.A):
             assert np.linalg.matrix_rank(np.hstack([pair[0] - pole * np.eye(n), pair[1]]), tol=1e-9) == n
     weights = [case.W_L, case.W_R, case.W_u, case.remainder_left, case.remainder_right]
-    copies = 1 if LOCATIONS[form].sees_input else 2
+    copies = 1 if Form(form).sees_input else 2
     assert n == copies * N + sum(w.n_states for w in weights)
 
 
@@ -189,7 +188,10 @@ def test_bound_against_the_worst_perturbation_found(form, structure, limit):
         loop_ = (
             np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.N is None else case.N.frequency_response(at)[0]
         )
-        T = response[k][:, case.uncertainty_input] @ case.W_L.frequency_response(at)[0]
+        T = (
+            response[k][:, slice(0, M) if case.location.at_input else slice(M, M + N)]
+            @ case.W_L.frequency_response(at)[0]
+        )
         found = worst_found(rng, T, loop_, case.M.frequency_response(at)[0])
         assert found <= bound[k] * (1 + 1e-9)
         assert bound[k] <= found * limit

@@ -156,7 +156,7 @@ def test_error_system_is_the_formula():
     for injection in Injection.INPUT, Injection.STATE:
         case = problem(1, injection)
         A, B, C, W_p = case.scaled
-        K = gain(np.linspace(0.01, 0.04, case.correction_size)[:, None], DT)
+        K = gain(np.linspace(0.01, 0.04, case.nothing.n_outputs)[:, None], DT)
         freqs = np.array([0.01, 1.0, 30.0, 400.0])
         loop = case.error_system(K).frequency_response(freqs)
         J = B if injection is Injection.INPUT else np.eye(4)

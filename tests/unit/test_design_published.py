@@ -13,7 +13,7 @@ from kros.synthesis import Injection, ObserverProblem
 from kros.synthesis.problem.plants import mixed_plant
 from kros.uncertainty import residual
 
-DT, UNITS, METHOD = 0.01, ("a", "b", "c"), Published(time_limit_s=20.0, max_order=2)
+DT, UNITS, METHOD = 0.01, ("a", "b", "c"), Published(max_order=2)
 
 
 def population() -> StateSpace:

@@ -8,7 +8,7 @@ from kros.lifting import Lifting
 from kros.observer.residual import one_step_residual, residual_spectra
 from kros.synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
 
-A, C, NOISE, SCALE, DT = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[1.0, 0.0]]), [1e-3], [1.0, 1.0], 1e-2
+A, C, NOISE, SCALE, DT = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[1.0, 0.0]]), np.array([1e-3]), np.ones(2), 1e-2
 
 
 def noise(*shape):

@@ -63,9 +63,12 @@ def require_identifier(name: str, what: str = "name") -> str:
     return name
 
 
-def rendered(package: str, files: Mapping[str, str], context: Mapping[str, Any]) -> dict[str, str]:
+def rendered(
+    package: str, files: Mapping[str, str], context: Mapping[str, Any], filters: Mapping[str, Any]
+) -> dict[str, str]:
     """Return the text of every file, by its name and that of its template in a package."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
+    environment.filters |= filters
     return {file: environment.get_template(f"{template}.jinja").render(context) for file, template in files.items()}

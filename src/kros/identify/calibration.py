@@ -65,13 +65,8 @@ class PhaseSpec:
 class Segment:
     """Phase of the error over one stretch of constant velocity."""
 
-    speed: float
+    speed: float  # negative in reverse
     phase: float
-
-    @property
-    def forward(self) -> bool:
-        """Direction of motion."""
-        return self.speed > 0
 
 
 @dataclass(frozen=True)
@@ -165,7 +160,7 @@ def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitP
         speed = abs(remaining[0].speed)
         group = [s for s in remaining if abs(s.speed) > (1 - spec.speed_tolerance) * speed]
         remaining = remaining[len(group) :]
-        forward, reverse = ([s for s in group if s.forward is ahead] for ahead in (True, False))
+        forward, reverse = ([s for s in group if (s.speed > 0) is ahead] for ahead in (True, False))
         if forward and reverse:
             (psi_f, r_f), (psi_r, r_r) = _circular_mean(forward), _circular_mean(reverse)
             phases.append((psi_f + psi_r) / 2)
@@ -173,7 +168,8 @@ def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitP
             concentrations.append(min(r_f, r_r))
             weights.append(min(len(forward), len(reverse)))
     if not phases:
-        directions = {"forward": sum(s.forward for s in segments), "reverse": sum(not s.forward for s in segments)}
+        ahead = sum(s.speed > 0 for s in segments)
+        directions = {"forward": ahead, "reverse": len(segments) - ahead}
         raise IdentificationError(
             f"Phase calibration of unit {unit}: needs constant-velocity segments of equal speed in both directions, "
             f"found {directions}; record such motion, or lift with sine and cosine and no phase parameter."
@@ -206,12 +202,10 @@ def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec
 Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]
 
 
-def calibrate(
-    population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work | None = None
-) -> PhaseCalibration:
+def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work) -> PhaseCalibration:
     """Calibrate all units on training episodes; one that cannot be calibrated is left out, its reason in the log."""
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
-    recalled = (work or Work()).recall("calibrate", segments_of, tasks, [_mark(facts, t) for t in tasks], list[Segment])
+    recalled = work.recall("calibrate", segments_of, tasks, [_mark(facts, t) for t in tasks], list[Segment])
     units: dict[str, UnitPhase] = {}
     for unit, segments in zip(facts.groups, recalled, strict=True):
         try:

@@ -99,10 +99,9 @@ def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
     p = R.shape[-1] - n_lifted
     alpha = np.asarray(alpha, dtype=float)
     batch = np.broadcast_shapes(R.shape[:-2], alpha.shape)
-    ridge = np.sqrt(alpha)[..., None, None] * np.eye(p)
-    top = np.broadcast_to(R[..., :p, :], (*batch, p, R.shape[-1]))
-    bottom = np.concatenate([np.broadcast_to(ridge, (*batch, p, p)), np.zeros((*batch, p, n_lifted))], axis=-1)
-    triangle = qr_triangle(np.concatenate([top, bottom], axis=-2))
+    parts = R[..., :p, :], np.sqrt(alpha)[..., None, None] * np.eye(p, R.shape[-1])
+    stacked = [np.broadcast_to(part, (*batch, p, R.shape[-1])) for part in parts]
+    triangle = qr_triangle(np.concatenate(stacked, axis=-2))
     R11, R12 = triangle[..., :p, :p], triangle[..., :p, p:]
     pivots = relative_pivots(R11)
     if np.any(pivots < p * EPS):

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +30,7 @@ from ..core.linalg import qr_triangle
 from ..core.rounding import ROUNDING
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
+from ..lifting.window import FormulaSeparation
 from .edmd import KoopmanMatrices, edmd
 
 log = logging.getLogger(__name__)
@@ -138,40 +138,37 @@ def episode_factors(
     values = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
     first = next(f for row in rows for f in row)
     none = Factor(np.zeros_like(first.R), np.zeros_like(first.peak), np.zeros_like(first.n_samples))
-    padded = [[replace(f, input_range=None) for f in row] + [none] * (most - len(row)) for row in rows]
-    return lifted_factor(Factor.stack([Factor.stack(row) for row in padded]), lifting, values, lifting)
+    padded = [Factor.stack(row + [none] * (most - len(row))) for row in rows]
+    return lifted_factor(Factor.stack(padded), lifting, values, lifting)
 
 
 def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array], model: Lifting) -> Factor:
     """Turn parameter-free factors into factors of ``[Psi | Theta_plus]`` for a model's lifting, or the linear one."""
-    n, b, r = lifting.n_states, len(lifting.separation.basis), len(lifting.input_separation.basis)
-    m = factor.R.shape[-1] - 2 * (n + b) - r
-    batch = factor.R.shape[:-2]
-    theta = np.zeros((*batch, n + b, model.n_lifted))  # columns of theta in terms of [x g]
-    theta[..., range(n), range(n)] = 1.0
-    peak = [factor.peak[..., :n]]
-    if model.functions:
-        M = lifting.separation.matrix(parameters)
-        theta[..., n:, n:] = np.swapaxes(M, -1, -2)
-        peak.append(_peaks(M, factor.peak[..., n : n + b]))
-    inputs = np.zeros((*batch, m + r, m + len(model.input_functions)))  # columns of the lifted inputs in terms of [u v]
-    inputs[..., range(m), range(m)] = 1.0
-    peak.append(factor.peak[..., n + b : n + b + m])
-    if model.input_functions:
-        N = lifting.input_separation.matrix(parameters)
-        inputs[..., m:, m:] = np.swapaxes(N, -1, -2)
-        peak.append(_peaks(N, factor.peak[..., n + b + m :]))
-    width = model.n_lifted + inputs.shape[-1]
-    change = np.zeros((*batch, factor.R.shape[-1], width + model.n_lifted))
-    change[..., : n + b, : model.n_lifted] = theta
-    change[..., n + b : n + b + m + r, model.n_lifted : width] = inputs
-    change[..., n + b + m + r :, width:] = theta
-    return Factor(qr_triangle(factor.R @ change), np.concatenate(peak, axis=-1), factor.n_samples, factor.input_range)
+    now, wide = lifting.n_states + len(lifting.separation.basis), factor.peak.shape[-1]  # columns of x+ are behind
+    peak, of_inputs = np.split(factor.peak, [now], axis=-1)
+    theta, peak = _widened(peak, lifting.separation, parameters, bool(model.functions))
+    inputs, of_inputs = _widened(of_inputs, lifting.input_separation, parameters, bool(model.input_functions))
+    lifted = theta.shape[-1]
+    width = lifted + inputs.shape[-1]
+    change = np.zeros((*factor.R.shape[:-1], width + lifted))
+    change[..., :now, :lifted] = change[..., wide:, width:] = theta
+    change[..., now:wide, lifted:width] = inputs
+    peak = np.concatenate([peak, of_inputs], axis=-1)
+    return Factor(qr_triangle(factor.R @ change), peak, factor.n_samples, factor.input_range)
 
 
-def _peaks(M: Array, peak: Array) -> Array:
-    """Bounds of the magnitudes of functions from those of their basis, shape (..., p)."""
-    return np.einsum("...ij,...j->...i", np.abs(M), peak)
+def _widened(
+    peak: Array, separation: FormulaSeparation, parameters: dict[str, Array], functions: bool
+) -> tuple[Array, Array]:
+    """Return columns of signals, and of functions if asked, in terms of signals and basis; and bounds of magnitudes."""
+    n, p = peak.shape[-1] - len(separation.basis), len(separation.terms) if functions else 0
+    change = np.zeros((*peak.shape, n + p))
+    change[..., range(n), range(n)] = 1.0
+    if not functions:
+        return change, peak[..., :n]
+    M = separation.matrix(parameters)
+    change[..., n:, n:] = np.swapaxes(M, -1, -2)
+    return change, np.concatenate([peak[..., :n], np.einsum("...ij,...j->...i", np.abs(M), peak[..., n:])], axis=-1)
 
 
 def require_excitation(
@@ -209,11 +206,6 @@ class Ranges:
         peak = np.where(peak > 0, peak, 1.0)
         return cls(peak[:n_lifted], peak[n_lifted:])
 
-    @property
-    def inverse(self) -> Ranges:
-        """Ranges that lead back."""
-        return Ranges(1 / self.outputs, 1 / self.inputs)
-
     def sizes(self, lifting: Lifting, recorded: tuple[str, ...]) -> dict[str, float]:
         """Return the ranges by name: of states, lifted functions, recorded inputs and functions of these."""
         names = (*lifting.names, *recorded, *lifting.input_functions)
@@ -226,18 +218,16 @@ class Ranges:
 
     def restore(self, models: KoopmanMatrices) -> KoopmanMatrices:
         """Return models of the channels as recorded from those of channels divided by the ranges."""
-        return self.inverse.normalise(models)
+        return Ranges(1 / self.outputs, 1 / self.inputs).normalise(models)
 
     def triangles(self, R: Array) -> Array:
         """Return factors of ``[Psi | Theta_plus]`` of channels divided by the ranges."""
         return R / np.concatenate([self.outputs, self.inputs, self.outputs])
 
     def factor(self, factor: Factor) -> Factor:
-        """Return the same with what else a factor holds."""
-        ends = factor.input_range
+        """Return factors of channels divided by the ranges, without the values of inputs."""
         peak = factor.peak / np.concatenate([self.outputs, self.inputs])
-        ends = None if ends is None else ends / self.inputs[: ends.shape[-1]]
-        return replace(factor, R=self.triangles(factor.R), peak=peak, input_range=ends)
+        return Factor(self.triangles(factor.R), peak, factor.n_samples)
 
     def edmd(self, R: Array, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
         """Return EDMD models of recorded channels whose regularisation acts on channels divided by the ranges."""

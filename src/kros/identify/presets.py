@@ -34,7 +34,7 @@ def resolve_lifting(
     """Return the lifting that is declared, or the plant's (35); families see no episodes of `test`."""
     inputs, functions = declared.input_functions, declared.functions or ()
     if declared.functions is None and not declared.families and population.metadata.get("plant") == HARMONIC_DRIVE:
-        functions = (f"sin({_declared_ratio(calibration, population):g}*position + {PHASE})",)
+        functions = (f"sin({_ratio(calibration.ratio, population):g}*position + {PHASE})",)
     sample = partial(_sample, population, test)
     functions = sum((family(table, sample) for table in declared.families), functions)
     parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
@@ -73,12 +73,9 @@ def resolve_phase(declared: CalibrationSettings, population: Population, lifting
     if not lifting.parameters:
         return None
     known: dict[str, Any] = declared.model_dump(exclude_none=True)
-    if "ratio" not in known and "gear_ratio" in population.metadata:
-        known["ratio"] = float(population.metadata["gear_ratio"])
-    if "ratio" not in known:
-        known = _written_ratio(lifting, population.states, known.get("angle")) | known
-    if "ratio" not in known:
-        raise ConfigError("Calibration: the ratio of the disturbance to the angle is unknown; set calibrate.ratio.")
+    if "ratio" not in known and "gear_ratio" not in population.metadata:
+        known = _written_ratio(lifting, population.states, declared.angle) | known
+    known["ratio"] = _ratio(known.get("ratio"), population)
     spec, channels = PhaseSpec(**known), population.states + population.inputs
     for name in (spec.angle, spec.reference, spec.measured):
         if name not in channels:
@@ -108,12 +105,13 @@ def gearbox_band_hz(
     """Return the band around the gearbox frequency at top speed, within 10 %; None for other plants."""
     if population.metadata.get("plant") != HARMONIC_DRIVE or not top_speed:
         return None
-    centre = _declared_ratio(declared, population) * top_speed / (2 * np.pi)
+    centre = _ratio(declared.ratio, population) * top_speed / (2 * np.pi)
     return (1 - _BAND) * centre, (1 + _BAND) * centre
 
 
-def _declared_ratio(declared: CalibrationSettings, population: Population) -> float:
-    ratio = declared.ratio if declared.ratio is not None else population.metadata.get("gear_ratio")
+def _ratio(declared: float | None, population: Population) -> float:
+    """Return the ratio that is declared, or that of the plant's gear."""
+    ratio = declared if declared is not None else population.metadata.get("gear_ratio")
     if ratio is None:
         raise ConfigError("Calibration: the ratio of the disturbance to the angle is unknown; set calibrate.ratio.")
     return float(ratio)

@@ -190,13 +190,15 @@ class _Reader:
         if name not in self.delayed:
             known = ", ".join(self.delayed) or "states and inputs"
             raise self._error(f"there is no {written}; only {known} have earlier values.")
-        negative = isinstance(index, ast.UnaryOp) and isinstance(index.op, ast.USub)
-        amount = index.operand if isinstance(index, ast.UnaryOp) else index
-        if not negative or not isinstance(amount, ast.Constant) or type(amount.value) is not int or not amount.value:
+        try:
+            place = ast.literal_eval(index)
+        except ValueError:
+            place = None
+        if type(place) is not int or place >= 0:
             raise self._error(f"{written} is no earlier value; give a whole number of samples, such as {name}[-1].")
-        if amount.value > MAX_DELAY:
+        if -place > MAX_DELAY:
             raise self._error(f"the delay in {written} is too deep; at most {MAX_DELAY} samples are kept.")
-        return sp.Symbol(delayed_name(name, amount.value), real=True)
+        return sp.Symbol(delayed_name(name, -place), real=True)
 
     def _error(self, problem: str) -> ConfigError:
         return ConfigError(f"Formula {self.text!r}: {problem}")

@@ -167,7 +167,7 @@ class Lifting:
 
     def parameter_values(self, parameters: Parameters | None = None) -> dict[str, Array]:
         """Return the values of all parameters, refusing to go on where one is missing."""
-        given = parameters if parameters is not None else {}
+        given = parameters or {}
         if missing := [name for name in self.parameters if name not in given]:
             problem = f"parameter values for {missing} are missing, found {sorted(given)}"
             raise DimensionError(f"Lifting: {problem}; calibrate the unit first.")

@@ -187,9 +187,8 @@ class Precision:
         return (text if any(c in text for c in ".en") else f"{text}.0") + self.suffix
 
 
-def c_code(expression: Any, name: Callable[[str], str], precision: Precision | None = None) -> str:
+def c_code(expression: Any, name: Callable[[str], str], precision: Precision) -> str:
     """Return a SymPy tree as a C expression."""
-    precision = precision or Precision()
     program, literal = Program.of([expression]), precision.literal
     numbers = map(literal, program.constants.tolist())
     texts = [*map(name, program.names), *(f"({text})" if text.startswith("-") else text for text in numbers)]

@@ -67,14 +67,16 @@ class Window:
     @cached_property
     def shift(self) -> Index:
         """Entry of ``[window, inputs]`` that every earlier value has at the next sample."""
-        entries = (*self.names, *self.inputs)
-        return np.array([entries.index(delayed_name(q, d - 1)) for q, d in self.delayed], dtype=np.intp)
+        return self._entries([delayed_name(q, d - 1) for q, d in self.delayed])
 
     @cached_property
     def present(self) -> Index:
         """Entry of ``[window, inputs]`` of the quantity that every earlier value is one of."""
+        return self._entries([q for q, _ in self.delayed])
+
+    def _entries(self, names: Sequence[str]) -> Index:
         entries = (*self.names, *self.inputs)
-        return np.array([entries.index(q) for q, _ in self.delayed], dtype=np.intp)
+        return np.array([entries.index(name) for name in names], dtype=np.intp)
 
     def advance(self, window: Array, u: Array) -> Array:
         """Return the earlier values of the next sample, shape (..., n_earlier), from a window and its inputs."""

@@ -171,10 +171,10 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         raise DataError(
             f"the names of states, inputs and parameters should differ, found {', '.join(twice)} more than once."
         )
-    keys = ("states", "lifting", "parameters", "lifting_inputs", "input_functions")
-    states, functions, parameters, inputs, gamma = (tuple(content[key]) for key in keys)
+    keys = ("states", "lifting", "parameters", "lifting_inputs", "input_functions", "measured")
+    states, functions, parameters, inputs, gamma, measured = (tuple(content[key]) for key in keys)
     sizes = tuple((name, float(size)) for name, size in content["sizes"])
-    lifting, measured = Lifting(states, functions, parameters, inputs, gamma, sizes), tuple(content["measured"])
+    lifting = Lifting(states, functions, parameters, inputs, gamma, sizes)
     if len(set(measured)) < len(measured) or not set(measured) <= set(range(lifting.n_states)):
         raise DataError(
             f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {list(measured)}."

@@ -191,10 +191,10 @@ def _choices(measured: tuple[int, ...], hidden: Sequence[int]) -> list[tuple[int
     return [(), *(tuple(sorted(measured + some)) for size in sizes for some in combinations(others, size))]
 
 
-def least_squares(regressors: Array, values: Array, rcond: float | None = None) -> Array:
+def least_squares(regressors: Array, values: Array) -> Array:
     """Return the smallest least-squares X of ``regressors X = values``, every regressor in units of its size."""
     largest = np.abs(regressors).max(axis=0, initial=0.0)
     largest[largest == 0] = 1.0
     size = largest * np.sqrt(np.mean((regressors / largest) ** 2, axis=0))
     size[size == 0] = 1.0
-    return np.linalg.lstsq(regressors / size, values, rcond=rcond)[0] / size[:, None]
+    return np.linalg.lstsq(regressors / size, values, rcond=None)[0] / size[:, None]

@@ -16,18 +16,18 @@ from ..core.linalg import balanced_size
 from ..core.rounding import ITERATED, ROUNDING, TINY
 from .generalized_plant import GeneralizedPlant
 
-# Label and remedy of each assumption.
-STABILISABLE = "A1a: (A, B2) stabilisable", "make the weights stable or let the control reach this mode"
-DETECTABLE = "A1b: (C2, A) detectable", "make the weights stable or measure this mode"
-CONTROL_PENALTY = "A2a: D12 of full column rank", "add a small correction penalty to z"
-MEASUREMENT_NOISE = "A2b: D21 of full row rank", "add measurement noise to w"
-NO_ZERO_CONTROL = (
-    "A3: no zero of (A, B2, C1, D12) on the stability boundary",
-    "make the weights stable, or penalise more outputs",
+# Label and remedy of each assumption, on controls and on measurements.
+REACHED = (
+    ("A1a: (A, B2) stabilisable", "make the weights stable or let the control reach this mode"),
+    ("A1b: (C2, A) detectable", "make the weights stable or measure this mode"),
 )
-NO_ZERO_MEASUREMENT = (
-    "A4: no zero of (A, B1, C2, D21) on the stability boundary",
-    "make the weights stable, or add process noise",
+REGULAR = (
+    ("A2a: D12 of full column rank", "add a small correction penalty to z"),
+    ("A2b: D21 of full row rank", "add measurement noise to w"),
+)
+NO_ZERO = (
+    ("A3: no zero of (A, B2, C1, D12) on the stability boundary", "make the weights stable, or penalise more outputs"),
+    ("A4: no zero of (A, B1, C2, D21) on the stability boundary", "make the weights stable, or add process noise"),
 )
 PROPER = "D11 = 0 in continuous time", "use a strictly proper weight"
 
@@ -44,25 +44,19 @@ def unreachable_modes(A: AnyArray, B: AnyArray, dt: float) -> list[complex]:
 
 def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> dict[tuple[str, str], str]:
     """Check every assumption of H2 synthesis and return those that fail, with the values."""
-    p, (n, _, n_u, _, n_y) = plant, plant.sizes
-    failed = {}
-    if modes := unreachable_modes(p.A, p.B2, p.dt):
-        failed[STABILISABLE] = f"mode {modes[0]:.6g}"
-    if modes := unreachable_modes(p.A.T, p.C2.T, p.dt):
-        failed[DETECTABLE] = f"mode {modes[0]:.6g}"
-    if (rank := _rank(p.D12)) < n_u:
-        failed[CONTROL_PENALTY] = f"rank {rank}, {n_u} controls"
-    if (rank := _rank(p.D21)) < n_y:
-        failed[MEASUREMENT_NOISE] = f"rank {rank}, {n_y} measurements"
+    p, failed = plant, {}
+    sides = (p.A, p.B2, p.C1, p.D12), (p.A.T, p.C2.T, p.B1.T, p.D21.T)
+    for (A, B, _, D), reached, regular in zip(sides, REACHED, REGULAR, strict=True):
+        if modes := unreachable_modes(A, B, p.dt):
+            failed[reached] = f"mode {modes[0]:.6g}"
+        if (rank := _rank(D)) < D.shape[1]:
+            failed[regular] = f"rank {rank} of {D.shape[1]}"
     if proper and p.dt == 0 and np.any(p.D11):
         failed[PROPER] = f"largest entry {np.abs(p.D11).max():.3g}"
-    if failed or not n:
+    if failed:
         return failed
-    if zeros := _boundary_zeros(p.A, p.B2, p.C1, p.D12, p.dt):
-        failed[NO_ZERO_CONTROL] = f"zero {zeros[0]:.6g}"
-    if zeros := _boundary_zeros(p.A.T, p.C2.T, p.B1.T, p.D21.T, p.dt):
-        failed[NO_ZERO_MEASUREMENT] = f"zero {zeros[0]:.6g}"
-    return failed
+    zeros = zip(NO_ZERO, (_boundary_zeros(*side, p.dt) for side in sides), strict=True)
+    return {label: f"zero {found[0]:.6g}" for label, found in zeros if found}
 
 
 def require(plant: Any, method: str, proper: bool = True) -> None:
@@ -101,12 +95,5 @@ def _rank(matrix: AnyArray) -> int:
 def _boundary_zeros(A: AnyArray, B: AnyArray, C: AnyArray, D: AnyArray, dt: float) -> list[complex]:
     """Zeros on the stability boundary: D of full column rank, eigenvalues of A - B D^+ C that the rest of C sees."""
     pinv = np.linalg.pinv(D)
-    inner, seen = _balanced((A - B @ pinv @ C).T, (C - D @ (pinv @ C)).T)
-    zeros = []
-    for mode in np.linalg.eigvals(inner):
-        distance = abs(abs(mode) - 1) if dt > 0 else abs(mode.real) / (1 + abs(mode))
-        if distance < ROUNDING:
-            values = np.linalg.svd(np.hstack([inner - mode * np.eye(len(A)), seen]), compute_uv=False)
-            if values[-1] <= ITERATED * values[0]:
-                zeros.append(complex(mode))
-    return zeros
+    modes = unreachable_modes((A - B @ pinv @ C).T, (C - D @ (pinv @ C)).T, dt)
+    return [mode for mode in modes if (abs(mode) - 1 if dt > 0 else mode.real / (1 + abs(mode))) < ROUNDING]

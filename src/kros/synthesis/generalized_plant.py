@@ -9,6 +9,7 @@ K : controller with matrices A^c, B^c, C^c, D^c
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from ..core.errors import DimensionError
 from ..core.lti import StateSpace, real_array, sampling_period
 from ..core.rounding import SINGULAR
 
-_MATRICES = ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21", "D22")
+_MATRICES = ("A", "B1", "B2", "C1", "D11", "D12", "C2", "D21", "D22")  # row by row
 
 
 @frozen
@@ -71,9 +72,7 @@ class GeneralizedPlant:
         object.__setattr__(self, "dt", sampling_period("Generalized plant", self.dt))
         n, (n_z, n_y) = self.A.shape[-1], (len(self.C1), len(self.C2))
         n_w, n_u = self.B1.shape[-1], self.B2.shape[-1]
-        expected = {"A": (n, n), "B1": (n, n_w), "B2": (n, n_u), "C1": (n_z, n), "C2": (n_y, n)}
-        expected |= {"D11": (n_z, n_w), "D12": (n_z, n_u), "D21": (n_y, n_w), "D22": (n_y, n_u)}
-        for name, shape in expected.items():
+        for name, shape in zip(_MATRICES, product((n, n_z, n_y), (n, n_w, n_u)), strict=True):
             if getattr(self, name).shape != shape:
                 shapes = {key: getattr(self, key).shape for key in _MATRICES}
                 raise DimensionError(f"Generalized plant: {name} should have shape {shape}, found {shapes}.")
@@ -116,20 +115,12 @@ class GeneralizedPlant:
         """Return the plant in the states ``T x`` for ``x = (T, T^-1)``, outputs multiplied by z, y, inputs by w, u."""
         n, n_w, n_u, n_z, n_y = self.sizes
         T, back = x or (np.eye(n), np.eye(n))
-        z, w = np.eye(n_z) if z is None else z, np.eye(n_w) if w is None else w
-        y, u = np.eye(n_y) if y is None else y, np.eye(n_u) if u is None else u
-        return replace(
-            self,
-            A=T @ self.A @ back,
-            B1=T @ self.B1 @ w,
-            B2=T @ self.B2 @ u,
-            C1=z @ self.C1 @ back,
-            C2=y @ self.C2 @ back,
-            D11=z @ self.D11 @ w,
-            D12=z @ self.D12 @ u,
-            D21=y @ self.D21 @ w,
-            D22=y @ self.D22 @ u,
+        w, u, z, y = (np.eye(size) if M is None else M for M, size in ((w, n_w), (u, n_u), (z, n_z), (y, n_y)))
+        matrices = (
+            row @ getattr(self, name) @ column
+            for name, (row, column) in zip(_MATRICES, product((T, z, y), (back, w, u)), strict=True)
         )
+        return replace(self, **dict(zip(_MATRICES, matrices, strict=True)))
 
     @property
     def performance(self) -> GeneralizedPlant:
@@ -160,7 +151,7 @@ class GeneralizedPlant:
             When sizes or sampling periods differ, or the loop is not well posed (``I - D22 D^c`` singular).
         """
         K = StateSpace.of(controller)
-        _, _, n_u, _, n_y = self.sizes
+        n, _, n_u, _, n_y = self.sizes
         if (K.n_outputs, K.n_inputs) != (n_u, n_y) or K.dt != self.dt or K.batch_shape:
             size = f"{K.n_outputs} x {K.n_inputs} at {K.dt} s"
             raise DimensionError(
@@ -169,15 +160,15 @@ class GeneralizedPlant:
         loop = np.eye(n_y) - self.D22 @ K.D
         if n_y and np.linalg.cond(loop) > SINGULAR:
             raise DimensionError("Closing the loop: I - D22 D^c is singular; use a strictly proper controller.")
-        # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
+        # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y; large gains stay out of what is inverted
         solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
-        y_x, y_w = solved[:, : self.A.shape[0] + K.n_states], solved[:, self.A.shape[0] + K.n_states :]
-        u_x = K.D @ y_x + np.hstack([np.zeros((n_u, self.A.shape[0])), K.C])
-        u_w = K.D @ y_w
-        A = np.vstack([np.hstack([self.A, np.zeros((self.A.shape[0], K.n_states))]) + self.B2 @ u_x, K.B @ y_x])
-        A[self.A.shape[0] :, self.A.shape[0] :] += K.A
-        C = np.hstack([self.C1, np.zeros((self.C1.shape[0], K.n_states))]) + self.D12 @ u_x
-        return StateSpace(A, np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), C, self.D11 + self.D12 @ u_w, self.dt)
+        y_x, y_w = np.split(solved, [n + K.n_states], axis=1)
+        u_x, u_w = K.D @ y_x + np.hstack([np.zeros((n_u, n)), K.C]), K.D @ y_w
+        more = (0, 0), (0, K.n_states)
+        A = np.vstack([np.pad(self.A, more) + self.B2 @ u_x, K.B @ y_x])
+        A[n:, n:] += K.A
+        B, C = np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), np.pad(self.C1, more) + self.D12 @ u_x
+        return StateSpace(A, B, C, self.D11 + self.D12 @ u_w, self.dt)
 
 
 def split(system: StateSpace, n_w: int, n_z: int, **parts: int | None) -> GeneralizedPlant:

@@ -45,8 +45,8 @@ class Status(str, Enum):
     CERTIFIED
         Verified and its guarantee recomputed; the distance to the optimum is at most `gap_percent` (where it is known).
     INACCURATE
-        The solver stopped early, but its result passed the same verification. Raise the time limit, or add measurement
-        noise and penalty, to come closer to the optimum.
+        The solver stopped early, but its result passed the same verification. Raise its number of steps, or add
+        measurement noise and penalty, to come closer to the optimum.
 
     Examples
     --------

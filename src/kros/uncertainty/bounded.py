@@ -7,7 +7,9 @@ there.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from ..core.linalg import sigma_max
 from .forms import Form, check_responses, misfit
 from .inputs import Options, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
-from .nominal import NominalChoice, choose_nominal
+from .nominal import choose_nominal
 from .settings import SET
 from .weights.fit import Residuals, fit_weight
 
@@ -33,17 +35,15 @@ def bound_systems(models: Any, form: Form, freqs_hz: ArrayLike | None, options: 
     units = scale_system(system, *scales)
     grid = log_grid(system.dt, longest_s=getattr(models, "longest_s", None)) if freqs_hz is None else freqs_hz
     freqs = check_grid(grid, system.dt)
-    choices = _choices(units.frequency_response(freqs))
-    index = options.row(ids, choices[form].index)
-    residuals = Residuals(
-        form,
-        units[index].frequency_response,
-        lambda f, rows: units[rows].frequency_response(f),
-        len(ids),
-        (units[index], units),
-    )
-    fields = _bound(residuals, freqs, (system.dt, options.max_order, options.tolerance_db), ids, index, choices)
-    return UncertainModel(nominal_system=system[index], output_scale=scales[0], input_scale=scales[1], **fields)
+
+    def residuals(index: int) -> Residuals:
+        nominal = units[index]
+        every = partial(Residuals, systems=(nominal, units))
+        return every(form, nominal.frequency_response, lambda f, rows: units[rows].frequency_response(f), len(ids))
+
+    fields = _bound(residuals, form, units.frequency_response(freqs), freqs, system.dt, ids, options)
+    nominal = system[fields["nominal"]]
+    return UncertainModel(nominal_system=nominal, output_scale=scales[0], input_scale=scales[1], **fields)
 
 
 def bound_responses(
@@ -57,23 +57,15 @@ def bound_responses(
     G = check_responses(responses, ids, freqs)
     scales = options.scales(G.shape[2:])
     units = G / scales[0][:, None] * scales[1]
-    choices = _choices(units)
-    index = options.row(ids, choices[form].index)
-    residuals = Residuals(
-        form,
-        lambda f: _between(freqs, units[[index]], f)[0],
-        lambda f, rows: _between(freqs, units[rows], f),
-        len(ids),
-    )
-    fields = _bound(residuals, freqs, (float(dt), options.max_order, options.tolerance_db), ids, index, choices)
+
+    def residuals(index: int) -> Residuals:
+        nominal = partial(_between, freqs, units[index], axis=0)
+        return Residuals(form, nominal, lambda f, rows: _between(freqs, units[rows], f), len(ids))
+
+    fields = _bound(residuals, form, units, freqs, float(dt), ids, options)
     fields |= {"output_scale": scales[0], "input_scale": scales[1], "sample_period_s": float(dt)}
     certificate = _certificate(freqs, fields["bounds"][form])
-    return ResponseUncertainty(nominal_response=G[index], certificate=certificate, **fields)
-
-
-def _choices(responses: AnyArray) -> dict[Form, NominalChoice]:
-    """Return the best nominal of every form."""
-    return {form: choose_nominal(responses, form) for form in Form}
+    return ResponseUncertainty(nominal_response=G[fields["nominal"]], certificate=certificate, **fields)
 
 
 def _certificate(freqs: AnyArray, bound: AnyArray) -> str:
@@ -89,24 +81,27 @@ def _certificate(freqs: AnyArray, bound: AnyArray) -> str:
     return text
 
 
-def _between(freqs: AnyArray, values: AnyArray, at_hz: AnyArray) -> AnyArray:
+def _between(freqs: AnyArray, values: AnyArray, at_hz: AnyArray, axis: int = 1) -> AnyArray:
     """Return responses (unit, frequency, p, m) at other frequencies, on straight lines, constant beyond the ends."""
     from scipy.interpolate import make_interp_spline
 
-    return make_interp_spline(freqs, values, k=1, axis=1)(np.clip(at_hz, freqs[0], freqs[-1]))
+    return make_interp_spline(freqs, values, k=1, axis=axis)(np.clip(at_hz, freqs[0], freqs[-1]))
 
 
 def _bound(
-    residuals: Residuals,
+    of: Callable[[int], Residuals],
+    form: Form,
+    units: AnyArray,
     freqs: AnyArray,
-    target: tuple[float, int, float],
+    dt: float,
     ids: tuple[str, ...],
-    index: int,
-    choices: dict[Form, Any],
+    options: Options,
 ) -> dict[str, Any]:
-    """Return the set around the nominal `index`, with the remainder where the form leaves one."""
+    """Return the set around the best nominal or that of the options, with the remainder where the form leaves one."""
+    choices = {form: choose_nominal(units, form) for form in Form}
+    index, target = options.row(ids, choices[form].index), (dt, options.max_order, options.tolerance_db)
+    residuals, G = of(index), units[index]
     weight, cover = fit_weight(residuals, freqs, *target)
-    G, form = residuals.nominal(freqs), residuals.form
     ratios, largest = zip(*((misfit(form, G, Gp), sigma_max(E)) for Gp, E in residuals.pieces(freqs)), strict=True)
     ratio, bound = np.concatenate(ratios), np.concatenate(largest).max(axis=0)
     fields = {

@@ -53,11 +53,27 @@ class Form(StrEnum):
 
     @property
     def inverse(self) -> bool:
-        """Whether the perturbed plant is rebuilt by an inverse."""
-        return self in (Form.INVERSE_ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+        """Whether the perturbation sees its own effect, so that the perturbed plant is rebuilt by an inverse."""
+        return self.value.startswith("inverse")
+
+    @property
+    def at_input(self) -> bool:
+        """Whether the perturbation acts on the plant's input, otherwise on its output."""
+        return self in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
+
+    @property
+    def sees_input(self) -> bool:
+        """Whether the perturbation sees the plant's input, otherwise its output."""
+        return self in (Form.ADDITIVE, Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
+
+    def sizes(self, outputs: int, inputs: int) -> tuple[int, int]:
+        """Return rows and columns of a residual between plants of a shape."""
+        return inputs if self.at_input else outputs, inputs if self.sees_input else outputs
 
 
-OUTPUT_SIDE = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+def evenly(count: int, most: int) -> AnyArray:
+    """Return at most so many rows, spread evenly over all."""
+    return np.unique(np.linspace(0, count - 1, most).round().astype(int))
 
 
 def as_form(form: Form | str) -> Form:
@@ -95,21 +111,16 @@ def residual(form: Form | str, nominal: ArrayLike, perturbed: ArrayLike, *, pape
     if not paper or form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
         return residual_of(form, G, Gp, np.linalg.pinv)
     inverse, other = (np.linalg.pinv(Gp), G) if form.inverse else (np.linalg.pinv(G), Gp)
-    product = other @ inverse if form in OUTPUT_SIDE else inverse @ other
+    product = inverse @ other if form.at_input else other @ inverse
     one = np.eye(product.shape[-1])
     return one - product if form.inverse else product - one
 
 
 def residual_of(form: Form, G: Any, Gp: Any, pinv: Callable[[Any], Any]) -> Any:
     """Return the residual of arrays, or of other plants with sums, products and a pseudo-inverse."""
-    difference = Gp - G
-    if form is Form.ADDITIVE:
-        return difference
-    inverse = pinv(Gp if form.inverse else G)
-    if form in OUTPUT_SIDE:
-        return difference @ inverse
-    product = inverse @ difference
-    return product @ pinv(G) if form is Form.INVERSE_ADDITIVE else product
+    E, other = Gp - G, Gp if form.inverse else G
+    E = pinv(other) @ E if form.at_input else E
+    return E if form.sees_input else E @ pinv(G if form.at_input else other)
 
 
 def rebuild(form: Form | str, nominal: ArrayLike, E: ArrayLike) -> AnyArray:
@@ -129,19 +140,18 @@ def rebuild(form: Form | str, nominal: ArrayLike, E: ArrayLike) -> AnyArray:
         return G + change_of(form, G, E)
     loop = loop_of(form, G, E)
     inverse = _inverse(np.eye(loop.shape[-1]) - loop)
-    return inverse @ G if form in OUTPUT_SIDE else G @ inverse
+    return G @ inverse if form.at_input else inverse @ G
 
 
 def change_of(form: Form, G: Any, E: Any) -> Any:
     """Return what a form without an inverse adds to the nominal plant."""
-    if form is Form.ADDITIVE:
-        return E
-    return E @ G if form in OUTPUT_SIDE else G @ E
+    seen = E if form.sees_input else E @ G
+    return G @ seen if form.at_input else seen
 
 
 def loop_of(form: Form, G: Any, E: Any) -> Any:
     """Return L of an inverse form, whose inverse is that of ``1 - L``."""
-    return E @ G if form is Form.INVERSE_ADDITIVE else E
+    return E if form.at_input is form.sees_input else E @ G
 
 
 def misfit(form: Form | str, nominal: ArrayLike, responses: ArrayLike) -> AnyArray:

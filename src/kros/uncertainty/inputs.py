@@ -107,10 +107,11 @@ def check_scale(side: str, values: ArrayLike | None, size: int) -> AnyArray:
 def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
     for k, name in enumerate(names):
-        if not all(np.isfinite(M).all() for M in (system[k].A, system[k].B, system[k].C, system[k].D)):
+        one = system[k]
+        if not all(np.isfinite(getattr(one, matrix)).all() for matrix in "ABCD"):
             raise DataError(f"Quantify: the model of {name} has NaN or infinity; leave it out or identify it again.")
-        if not system[k].is_stable():
-            problem = f"the model of {name} is unstable (spectral radius {system[k].spectral_radius():.6f})"
+        if not one.is_stable():
+            problem = f"the model of {name} is unstable (spectral radius {one.spectral_radius():.6f})"
             raise DataError(f"Quantify: {problem}; identify with more regularisation or leave it out.")
 
 

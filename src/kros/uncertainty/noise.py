@@ -25,7 +25,7 @@ from ..core.artifacts import save_artifact
 from ..core.errors import DataError
 from ..core.linalg import sigma_max, squared
 from ..identify.bootstrap import ModelSamples
-from .forms import Form, residual
+from .forms import Form, evenly, residual
 from .settings import OUTLIER
 
 
@@ -71,8 +71,7 @@ def noise_share(
         for part in (slice(start, start + step) for start in range(0, len(freqs_hz), step)):
             drawn = models.responses(row, freqs_hz[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += _mean_square(residual(form, drawn, np.roll(drawn, 1, axis=0))) / units
-    nominals = np.unique(np.linspace(0, units - 1, min(units, OUTLIER.nominals)).round().astype(int))
-    between = np.mean([_mean_square(residual(form, G[k], G)) for k in nominals], axis=0)
+    between = np.mean([_mean_square(residual(form, G[k], G)) for k in evenly(units, OUTLIER.nominals)], axis=0)
     largest = sigma_max(residual(form, G[nominal], G)).max(axis=0)
     return NoiseShare(freqs_hz, between * units / (units - 1), noise, largest)
 

@@ -34,7 +34,6 @@ from .settings import QuantifySettings
 from .unit_residuals import UnitResiduals, unit_residuals
 
 _KIND = "choice"
-_FACTS = ("nominal", "worst_off_nominal")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,7 +79,7 @@ class UncertainModels(Shown):
         for place, outliers in self.outliers.items():
             outliers.save(folder / "outliers" / place)
         write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
-        content = {name: getattr(self, name) for name in _FACTS}
+        content: dict[str, Any] = {"nominal": self.nominal, "worst_off_nominal": self.worst_off_nominal}
         content |= {"kinds": list(self.sets), "outliers": list(self.outliers)}
         save_artifact(folder / "uncertainty", _KIND, content)
 
@@ -96,9 +95,8 @@ class UncertainModels(Shown):
         content, _ = load_artifact(folder / "uncertainty", _KIND)
         sets = Stored(UncertainModel.load, {kind: folder / "uncertainty" / kind for kind in content["kinds"]})
         outliers = Stored(OutlierModel.load, {place: folder / "outliers" / place for place in content["outliers"]})
-        facts = {name: content[name] for name in _FACTS}
         scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
-        return cls(models=models, sets=sets, scores=scores, outliers=outliers, **facts)
+        return cls(models, content["nominal"], content["worst_off_nominal"], sets, scores, outliers)
 
 
 def quantify(
@@ -140,7 +138,7 @@ def quantify(
     Raises
     ------
     IdentificationError
-        Fewer than two identified units are left, or the nominal is none of them.
+        Fewer than two identified units are left.
     DimensionError
         Sizes, sampling periods or frequencies differ, or scales do not fit.
     DataError
@@ -162,7 +160,7 @@ def quantify(
     if isinstance(models, IdentifiedModels):
         given = {} if freqs_hz is None else {"freqs_hz": freqs_hz}
         settings = QuantifySettings.of({"form": getattr(form, "value", form)} | given | options, "Quantify")
-        return _quantify_population(models, settings, work)
+        return _quantify_population(models, settings, work or Work())
     if isinstance(models, Mapping):
         options["unit_ids"], models = tuple(models), list(models.values())
     if isinstance(models, list | tuple) and models and all(hasattr(model, "frdata") for model in models):
@@ -173,7 +171,7 @@ def quantify(
     return bound(models, as_form(form), freqs_hz, Options.of(options, "Quantify"))
 
 
-def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work | None) -> UncertainModels:
+def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work) -> UncertainModels:
     """Score outliers, choose the nominal of the first kind of models, and bound every kind around it."""
     outliers, scores = score_population(models, settings, work)
     first = models.models()
@@ -181,24 +179,15 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
     if len(units) < 2:
         problem = f"Uncertainty: {len(units)} units of {len(models.facts.pooled)} have models, at least two are needed"
         raise IdentificationError(f"{problem}; record more units in the condition that feeds synthesis.")
-    nominal = choose_unit(first, units, settings)
+    responses = first.scaled_responses(first.frequencies(settings.n_freqs), units)
+    nominal = settings.nominal or units[choose_nominal(responses, settings.form).index]  # as in the paper, for all
     same = {"max_order": settings.max_order, "tolerance_db": settings.tolerance_db}
     options = Options(unit_ids=tuple(units), nominal=nominal, **same)
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
     tasks = [partial(bound_systems, *one, options) for one in every]
-    sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
+    sets = dict(zip(models.kinds, work.run("quantify", tasks), strict=True))
     worst_off = worst_off_nominal(first, sets[models.kinds[0]])
     return UncertainModels(models, nominal, worst_off, sets, tuple(scores), outliers)
-
-
-def choose_unit(models: ModelSet, units: list[str], settings: QuantifySettings) -> str:
-    """Return the nominal unit, by default the best of the first kind of models, shared by all as in the paper."""
-    if settings.nominal is None:
-        responses = models.scaled_responses(models.frequencies(settings.n_freqs), units)
-        return units[choose_nominal(responses, settings.form).index]
-    if settings.nominal not in units:
-        raise IdentificationError(f"Quantify: nominal {settings.nominal!r} is not among the units {', '.join(units)}.")
-    return settings.nominal
 
 
 def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:

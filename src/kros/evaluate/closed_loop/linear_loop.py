@@ -1,6 +1,6 @@
 r"""The linear loop of plant, estimator and controller, with the perturbation of the uncertain set in it.
 
-        w                         z        P is the nominal with its weights (`UncertaintyLocation` says where
+        w                         z        P is the nominal with its weights (`Form` says where
         |   +-------------------+ ^        they act, and on what they see), or the model of a unit without them.
         +-->|         P         |-+        F is strictly causal and reads measurements, functions of what is
 u --+------>|                   |--> x     measured, and inputs. Signals are divided by their ranges.

@@ -77,9 +77,9 @@ class CompiledObserver:
         if compiler is None:
             raise ConfigError(f"Compiling {folder}: there is no C compiler, tried {', '.join(COMPILERS)}; install one.")
         manifest = json.loads((folder / "manifest.json").read_text())
-        sizes = {"q": len(manifest["measured"]), "m": len(manifest["inputs"]), "n": len(manifest["states"])}
+        q, m, n = (len(manifest[key]) for key in ("measured", "inputs", "states"))
         name = manifest["name"]
-        library, loop = folder / f"lib{name}.so", _LOOP.format(name=name, wide=_wide(manifest), **sizes)
+        library, loop = folder / f"lib{name}.so", _LOOP.format(name=name, wide=_wide(manifest), q=q, m=m, n=n)
         sources = [f"-I{folder}", str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c"), "-x", "c", "-"]
         try:
             compile_library([compiler, *FLAGS, *flags, *sources], library, loop)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
-from ..text import plain, plain_names, require_identifier
+from ..text import plain, plain_names, rendered, require_identifier
 from .origin import OriginShift, find_shift
 from .realise import RULE, realised
 
@@ -80,100 +80,66 @@ class Source:
         shift = find_shift(observer) if precision == "float" else None
         return cls(observer, name, Precision(precision), shift, loop, load)
 
-    def context(self) -> Named:
-        """Return everything that the templates name."""
-        lifting = self.observer.lifting
-        parts = {"monitor": self.monitor(), "guard": self.guard(), "bank": self.bank(), "tracked": self.tracked()}
-        parts |= self.layout() | self.linear() | self.limits() | self.origin()
-        return parts | {
-            "sigma": [self.code(f.expression) for f in lifting.formulas],
-            "gamma": [self.code(f.expression) for f in lifting.input_formulas],
-            "sigma_uses_parameters": any(set(f.used) & set(lifting.parameters) for f in lifting.formulas),
-            "load": self.load_torque(),
-            "sample_period_s": DOUBLE.literal(self.observer.sample_period_s),
-        }
+    def rendered(self, package: str, files: Mapping[str, str], more: Named) -> dict[str, str]:
+        """Return the text of every file, by its name and that of its template in a package."""
+        filters = {"row": self.row, "sums": self.sums, "literal": self.precision.literal, "code": self.code}
+        filters |= {"double": DOUBLE.literal, "wide": row, "plain": plain}
+        return rendered(package, files, self.context() | more, filters)
 
-    def layout(self) -> Named:
-        """Return names, units of measure, and numbers of states, channels and samples."""
-        o, factors, measured, lifting = self.observer, self.factors(), self.observer.outputs, self.observer.lifting
+    def context(self) -> Named:
+        """Return what the templates name: the observer and its parts, names, sizes, and matrices."""
+        o, lifting, loop, factors = self.observer, self.observer.lifting, self.loop, self.factors()
+        low, high = bounds(o.guard, lifting.n_states, o.controller.n_states)
         return {
+            "o": o,
+            "lifting": lifting,
+            "precision": self.precision,
+            "single": self.precision.type == "float",
+            "monitor": o.monitor,
+            "bank": o.bank,
+            "shift": self.shift,
+            "shift_others": self.shift_others,
+            "load": self.load_torque(),
+            "tracked": None if loop is None else self.tracked(loop),
             "name": self.name,
             "NAME": self.name.upper(),
-            "observer_name": plain(o.name),
-            "real": self.precision.type,
-            "suffix": self.precision.suffix,
-            "zero": self.precision.literal(0.0),
-            "one": self.precision.literal(1.0),
-            "single": self.precision.type == "float",
             "states": plain_names(o.recorded),
-            "measured": plain_names(measured),
+            "measured": plain_names(o.outputs),
             "inputs": plain_names(o.inputs),
             "parameters": lifting.parameters,
             "signals": self.signals(),
+            "factors": factors,
             "x_factor": self.literals([1 / factors[s] for s in o.recorded]),
-            **{f"{k}_factor": self.literals([factors[s] for s in v]) for k, v in (("y", measured), ("u", o.inputs))},
-            "at": o.measured,
+            "y_factor": self.literals([factors[s] for s in o.outputs]),
+            "u_factor": self.literals([factors[s] for s in o.inputs]),
+            "at": list(o.measured),
             "n": lifting.n_states,
             "recorded": len(o.recorded),
-            "q": len(measured),
+            "q": len(o.measured),
             "m": len(o.inputs),
-            "functions": lifting.n_lifted - lifting.n_states,
-            "widened": o.B.shape[1],
+            "functions": len(lifting.functions),
             "order": o.controller.n_states,
             "delay": o.runtime.delay,
-            "longest": LONGEST,
             "history": len(lifting.window.earlier),
-            "window_shift": lifting.window.shift.tolist(),
-            "window_present": lifting.window.present.tolist(),
-        }
+            "guard": np.clip([low, high], -self.precision.largest, self.precision.largest),
+            "bounds": self.bounds(),
+            "longest_age": longest_age,
+            "rule": {"longest": LONGEST, "beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},
+            "far": RULE.far,
+        } | self.linear()
+
+    @property
+    def shift_others(self) -> list[int]:
+        """Recorded states beside the measured one that move with the origin."""
+        moving = [] if self.shift is None else np.flatnonzero(self.shift.states[: len(self.observer.recorded)]).tolist()
+        return [i for i in moving if i != self.observer.measured[0]]
 
     def linear(self) -> Named:
         """Return the model and the correction, zeros left out."""
         o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
         parts = np.hstack([o.A, o.B])[:n], o.into[:n] @ np.hstack([K.C, K.D]), np.hstack([K.A, K.B])
         sums = dict(zip(("model", "correction", "controller"), map(self.sums, parts), strict=True))
-        return sums | {
-            "operations": sum(np.count_nonzero(part) for part in parts),
-            "filter_gain": self.sums(o.filter_gain),
-        }
-
-    def limits(self) -> Named:
-        """Return limits and default parameters."""
-        o, q, bounds, sides = self.observer, len(self.observer.measured), self.bounds(), self.observer.runtime.sides
-        largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, o.outputs))
-        return {
-            "clips_estimate": bool(o.runtime.limits()),
-            **dict(zip(("lower", "upper"), map(row, sides(o.lifting.n_states)), strict=True)),
-            "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
-            "y_bounds": bounds[:q],
-            "u_bounds": bounds[q:],
-            "default_parameters": self.row(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
-        }
-
-    def origin(self) -> Named:
-        """Return how the origin moves; nothing where it cannot."""
-        shift, o = self.shift, self.observer
-        if shift is None:
-            return {"shift": None, "relative_inputs": [], "shift_others": []}
-        return {
-            "shift": shift,
-            "shift_states": row(shift.states),
-            "shift_whole": row(shift.whole),
-            "shift_rest": row(shift.rest),
-            "relative_inputs": [self.relative_input(j) for j in range(len(o.inputs))],
-            "shift_others": [i for i in range(len(o.recorded)) if i != o.measured[0] and shift.states[i] != 0],
-            "far": self.precision.literal(RULE.far * shift.period),
-            "period": DOUBLE.literal(shift.period),
-            "recorded_period": abs(shift.period / self.factors()[o.outputs[0]]),
-        }
-
-    def relative_input(self, j: int) -> str:
-        """Return an input relative to the origin: an exact difference first, and nothing that is zero."""
-        assert self.shift is not None
-        whole, text = float(self.shift.whole[j]), f"s->held[{j}]"
-        if whole != 0:
-            text += " - s->origin" if whole == 1 else f" - ({DOUBLE.literal(whole)} * s->origin)"
-        return text if self.shift.rest[j] == 0 else f"({text}) - s->moved_u[{j}]"
+        return sums | {"operations": sum(np.count_nonzero(part) for part in parts)}
 
     def factors(self) -> dict[str, float]:
         """Return by what recordings are multiplied, by name; a load torque has the unit of its current."""
@@ -195,13 +161,9 @@ class Source:
         """Return the literals of factors in double precision; none where all are one."""
         return [] if all(factor == 1 for factor in factors) else row(np.array(factors))
 
-    def tracked(self) -> Named | None:
+    def tracked(self, loop: PhaseLockedLoop) -> Named:
         """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""
-        if self.loop is None:
-            return None
-        o, K, name, write = self.observer, self.observer.controller, self.loop.name, self.precision.literal
-        n, states = o.lifting.n_states, o.lifting.states
-
+        o, name, n, states = self.observer, loop.name, self.observer.lifting.n_states, self.observer.lifting.states
         slopes, given = [], () if o.bank is None else o.measured  # measurements take the place of estimates
         for f in o.lifting.formulas:
             by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used and j not in given}
@@ -213,79 +175,32 @@ class Source:
             "slopes": slopes,
             "reads_states": any("w[" in str(row) for row in slopes),
             "model": self.sums(_uncorrected(o)[:n]),
-            "correction": self.sums((o.into @ K.C)[:n]),
-            "shares": [write(float(v) ** -2) for v in measurement_sizes(o)],
-            "settle_s": f"{o.sample_period_s / self.loop.forget:g}",
-            "forget": write(self.loop.forget),
-            "most": write(MOST),
+            "correction": self.sums((o.into @ o.controller.C)[:n]),
+            "shares": self.row(measurement_sizes(o) ** -2),
+            "settle_s": o.sample_period_s / loop.forget,
+            "forget": self.precision.literal(loop.forget),
+            "most": self.precision.literal(MOST),
         }
 
     def load_torque(self) -> Named | None:
-        """Return the numbers of `AngleLoad`, in double precision: it sums up without end."""
+        """Return the numbers of `AngleLoad`."""
         if self.load is None:
             return None
-        level, places, write = self.load.level, self.observer.recorded, DOUBLE.literal
+        level, load, current = self.load.level, self.load.load, self.load.current
         return {
-            "load_name": plain(self.load.load),
-            "current_name": plain(self.load.current),
-            "factor": self.factor(self.load.current),
+            "level": level,
+            "limited": np.isfinite(level.limit),
+            "load_name": plain(load),
+            "current_name": plain(current),
+            "factor": self.factor(current),
             "angle_factor": self.factor(self.observer.outputs[0]),
-            "load": places.index(self.load.load),
-            "current": places.index(self.load.current),
-            "pole": write(level.pole),
-            "period": write(level.sample_period_s),
-            "trust": write(0.5 * level.settling_s),
-            "limit": write(level.limit) if np.isfinite(level.limit) else None,
-            "trusted": write(level.trusted * level.limit) if np.isfinite(level.limit) else None,
+            "load": self.observer.recorded.index(load),
+            "current": self.observer.recorded.index(current),
         }
 
     def factor(self, name: str) -> str | None:
         """Return the literal of a channel's factor; None where it is one."""
-        return next(iter(self.literals(recorded_factors(self.observer, [name]).tolist())), None)
-
-    def bank(self) -> Named | None:
-        """Return what a filter bank starts with and does in gaps; None where the observer is none."""
-        own, o, first = self.observer.bank, self.observer, len(self.observer.recorded)
-        if own is None:
-            return None
-        z = slice(first, first + own.filters)
-        return {
-            "filters": own.filters,
-            "first": first,
-            "fallback": o.lifting.n_states - first,
-            "start": self.sums(own.start),
-            **{name: self.row(getattr(own, name)) for name in ("forget", "reach", "half", "recovery")},
-            "longest": self.row(longest_age(own.half)),
-            "ramp": self.sums(o.A[z, z]),
-            "into": self.row(o.A[z][:, list(o.measured)]),
-            "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
-        }
-
-    def monitor(self) -> Named | None:
-        """Return what the monitor computes with; None where the observer has none."""
-        own = self.observer.monitor
-        if own is None:
-            return None
-        numbers = {"quiet": QUIET, "forget": own.forget, "first": max(own.first, own.forget), "largest": LARGEST}
-        return {
-            "bands": len(own.filters),
-            "filters": self.row(own.filters),
-            "inverse_size": self.row(1 / own.size),
-            "inverse_limit": self.row(1 / own.limits),
-            "weights": own.weights.astype(int).tolist(),
-            **{name: self.precision.literal(value) for name, value in numbers.items()},
-            "settle": own.settle,
-            "recovery": RECOVERY,
-            "percent": f"{100 * own.false_alarm_rate:g}",
-            "units": own.units,
-        }
-
-    def guard(self) -> Named:
-        """Return the bounds of states and of the correction, and how long a start takes."""
-        own, n, most = self.observer.guard, self.observer.lifting.n_states, self.precision.largest
-        low, high = np.clip(bounds(own, n, self.observer.controller.n_states), -most, most)
-        sides = {"lower": row(low[:n]), "upper": row(high[:n]), "settle": own.settle if own else 0}
-        return sides | {"correction": self.row(high[n:])}
+        return next(iter(self.literals([self.factors()[name]])), None)
 
     def symbol(self, name: str) -> str:
         """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""

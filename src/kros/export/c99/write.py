@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from ...core.artifacts import json_bytes, with_checksum
 from ...core.files import whole_folder, write_bytes
 from ...observer import Observer
 from ...observer.file import observer_content
-from ..text import rendered
 from .numbers import TOLERANCE, LoadOutput, Source
 
 
@@ -82,12 +80,12 @@ def export_c(
 def c_files(observer: Observer, source: Source) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     name, track = source.name, None if source.loop is None else source.loop.name
-    context = source.context() | {"version": version("kros"), **_golden(observer, source, track)}
-    context["state_bytes"] = _state_bytes(context)
+    state_bytes = _state_bytes(source)
     texts = {f"{name}.h": "observer.h", f"{name}.c": "observer.c", f"{name}_selftest.c": "selftest.c"}
     texts |= {file: file for file in ("example_main.c", "CMakeLists.txt", "README.md")}
-    manifest = _manifest(observer, context) | ({} if track is None else {"tracked": track})
-    return rendered("kros.export.c99", texts, context) | {"manifest.json": json_bytes(manifest).decode()}
+    more = {"version": version("kros"), "state_bytes": state_bytes, **_golden(observer, source, track)}
+    manifest = _manifest(observer, source, state_bytes) | ({} if track is None else {"tracked": track})
+    return source.rendered("kros.export.c99", texts, more) | {"manifest.json": json_bytes(manifest).decode()}
 
 
 def _golden(observer: Observer, source: Source, track: str | None) -> dict[str, Any]:
@@ -113,18 +111,18 @@ def _golden(observer: Observer, source: Source, track: str | None) -> dict[str, 
     return {"golden": literals, "tolerance": tolerance}
 
 
-def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
+def _manifest(observer: Observer, source: Source, state_bytes: int) -> dict[str, Any]:
     deployed = json_bytes(with_checksum(observer_content(observer)))
     return {
-        "name": context["name"],
-        "precision": context["real"],
+        "name": source.name,
+        "precision": source.precision.type,
         "states": list(observer.recorded),
         "measured": observer.outputs,
         "inputs": list(observer.inputs),
         "parameters": list(observer.lifting.parameters),
-        "units_of_measure": {s["name"]: s["unit"] for s in context["signals"]},
+        "units_of_measure": {s["name"]: s["unit"] for s in source.signals()},
         "sample_period_s": observer.sample_period_s,
-        "state_bytes": context["state_bytes"],
+        "state_bytes": state_bytes,
         "observer": observer.name,
         "kros": version("kros"),
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
@@ -137,16 +135,16 @@ def _sample(value: float) -> str:
     return "ABSENT" if np.isnan(value) else "BEYOND"
 
 
-def _state_bytes(context: Mapping[str, Any]) -> int:
+def _state_bytes(source: Source) -> int:
     """Return the size of the state: doubles first, then numbers of the build's precision, then words of four bytes."""
-    of, bank, monitor = context.__getitem__, context["bank"], context["monitor"]
-    real = 4 if of("single") else 8
-    doubles = of("m") + (1 + of("m") + len(of("shift_others")) if of("shift") else 0)
-    reals = of("n") + of("order") + of("history") + len(of("parameters")) + of("delay") * of("m")
-    reals += of("n") + of("order") + 2 if of("tracked") else 0
-    reals += 2 * of("recorded") + of("q") * (bank["filters"] + 1) if bank else 0
-    reals += of("q") * monitor["bands"] * 3 + 1 if monitor else 0
-    words = of("m") + bool(of("delay")) + bool(monitor) + 2
+    o, q, m = source.observer, len(source.observer.measured), len(source.observer.inputs)
+    real, n, order = 4 if source.precision.type == "float" else 8, o.lifting.n_states, o.controller.n_states
+    doubles = m + (1 + m + len(source.shift_others) if source.shift else 0)
+    reals = n + order + len(o.lifting.window.earlier) + len(o.lifting.parameters) + o.runtime.delay * m
+    reals += n + order + 2 if source.loop else 0
+    reals += 2 * len(o.recorded) + q * (o.bank.filters + 1) if o.bank else 0
+    reals += q * len(o.monitor.filters) * 3 + 1 if o.monitor else 0
+    words = m + bool(o.runtime.delay) + bool(o.monitor) + 2
     align = 8 if doubles or real == 8 else 4
     return -(-(8 * doubles + real * reals + 4 * words) // align) * align
 

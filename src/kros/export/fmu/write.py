@@ -23,7 +23,7 @@ from ...observer.units import recorded_channel
 from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
 from ..c99.write import c_files
-from ..text import plain, rendered
+from ..text import plain
 
 log = logging.getLogger(__name__)
 _KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
@@ -97,10 +97,10 @@ def export_fmu(
 def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
     """Return the files that make C source an FMU."""
     observer, name = source.observer, source.name
-    declared = {c: recorded_channel(observer, c).unit for c in (*observer.recorded, *observer.inputs)}
-    units = {c: plain(unit) for c, unit in declared.items() if unit}
+    names = (*observer.recorded, *observer.inputs)
+    units = {c: plain(unit) for c in names if (unit := recorded_channel(observer, c).unit)}
     estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
-    context = source.context() | {
+    more = {
         "version": version("kros"),
         "fmi": fmi,
         "guid": guid,
@@ -111,7 +111,7 @@ def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
     files = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
     if fmi == 3:
         files["sources/buildDescription.xml"] = "build.xml"
-    return rendered("kros.export.fmu", files, context)
+    return source.rendered("kros.export.fmu", files, more)
 
 
 def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[str]) -> list[dict[str, Any]]:

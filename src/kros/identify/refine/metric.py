@@ -12,8 +12,6 @@ which is quadratic below `level`; a power above one flattens the residual's peak
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ...core.arrays import AnyArray, Array, frozen
@@ -21,9 +19,9 @@ from ...core.linalg import adjoint, entries_first, multiply, sigma_max_first
 from .minimax import smallest_largest
 
 
-def unit_circle(points: int, decades: int = 6) -> AnyArray:
-    """Return ``exp(j omega)`` at logarithmic frequencies, some decades below Nyquist up to it."""
-    return np.exp(1j * np.pi * np.logspace(-decades, 0, points))
+def unit_circle(points: int) -> AnyArray:
+    """Return ``exp(j omega)`` at logarithmic frequencies, six decades below Nyquist up to it."""
+    return np.exp(1j * np.pi * np.logspace(-6, 0, points))
 
 
 @frozen
@@ -37,10 +35,6 @@ class ResponsePrior:
     power: int
     weight: float = 1.0
     points: int = 100
-
-    def scaled(self, weight: float) -> ResponsePrior:
-        """Return the same prior with another weight."""
-        return replace(self, weight=weight)
 
     def residual(self, V: Array) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return E (unit, frequency, m, m) of models V, ``G^+ Phi`` and ``T^T Z (I - E)``."""

@@ -19,6 +19,7 @@ from ...core.arrays import Array, Flags, Whole
 from ...core.errors import IdentificationError
 from ...core.linalg import qr_triangle, radius_text
 from ...core.rounding import EPS, TINY
+from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
@@ -98,7 +99,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     problem = _around(problem, one_model, common)
     path, scores, peaks = _path(data, problem, common)
     choice = _choose(scores, peaks, options)
-    strength = _falling(options)[choice]
+    strength = options.strengths[choice]
     log.info("prior of strength %g chosen, held-out score %.4g", strength, scores[choice])
     final = replace(problem, segments=segments).with_prior(strength)
     solution = _fit(final, path[choice], replace(options.search, iterations=options.final_iterations))
@@ -115,11 +116,6 @@ def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Ar
     return replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
 
 
-def _falling(options: RefineOptions) -> list[float]:
-    """Return the strengths of the prior, strongest first."""
-    return sorted(options.strengths, reverse=True)
-
-
 def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], Array, Array]:
     """Fit all units at falling strengths, until weaker ones bring nothing; return parameters, scores and peaks."""
     options = problem.options
@@ -127,7 +123,7 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
     path: list[Array] = []
     rows: list[tuple[float, float]] = []
-    for strength in _falling(options):
+    for strength in options.strengths:
         V = _fit(problem.with_prior(strength), V, search).V
         path.append(V)
         rows.append(trade_off(data, problem, V))
@@ -252,23 +248,19 @@ def free_run_errors(
     keys: Sequence[EpisodeKey],
 ) -> tuple[Array, Array]:
     """Return RMS errors of free runs, and the largest values that they reach, both (episode, n)."""
-    n, h = lifting.n_states, lifting.history
     errors = []
     for part in (slice(start, start + _TOGETHER) for start in range(0, len(keys), _TOGETHER)):
-        episodes = [population.read(key) for key in keys[part]]
-        recorded = np.zeros((len(episodes), max(map(len, episodes)), episodes[0].shape[1]))
-        for row, episode in enumerate(episodes):
-            recorded[row, : len(episode)] = episode
+        batch = EpisodeBatch.read(population, keys[part])
         values = {name: given[part] for name, given in parameters.items()}
-        first, u = recorded[:, : h + 1, :n], recorded[..., n:]
-        runs = free_run(models.A[part], models.B[part], lifting, values, first, u)
+        x, u = (np.ascontiguousarray(np.swapaxes(signal, 0, 1)) for signal in (batch.states, batch.inputs))
+        runs = free_run(models.A[part], models.B[part], lifting, values, x[:, : lifting.history + 1], u)
+        inside = (np.arange(x.shape[1]) < batch.lengths[:, None])[..., None]
         with np.errstate(over="ignore", invalid="ignore"):
-            for episode, run in zip(episodes, runs, strict=True):
-                x, reached = episode[:, :n], run[: len(episode)]
-                errors.append((np.sqrt(np.mean((reached - x) ** 2, axis=0)), np.abs(reached).max(axis=0)))
-    both = np.array(errors)
+            squares = np.where(inside, (runs - x) ** 2, 0.0).sum(axis=1) / batch.lengths[:, None]
+            errors.append((np.sqrt(squares), np.where(inside, np.abs(runs), 0.0).max(axis=1)))
+    both = np.concatenate(errors, axis=1)
     both[~np.isfinite(both)] = np.inf
-    return both[:, 0], both[:, 1]
+    return both[0], both[1]
 
 
 def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -> None:

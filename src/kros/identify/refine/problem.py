@@ -124,7 +124,7 @@ class RefinementProblem:
     def with_prior(self, strength: float) -> RefinementProblem:
         """Return the problem with a prior in proportion to the residuals that a unit's free runs have."""
         assert self.prior is not None
-        return replace(self, prior=self.prior.scaled(strength * self.residuals))
+        return replace(self, prior=replace(self.prior, weight=strength * self.residuals))
 
     def admissible(self, V: Array) -> Flags:
         """Return which models are finite and stable as linear systems."""

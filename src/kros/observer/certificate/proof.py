@@ -63,10 +63,8 @@ class Proof:
 
 def first_proof(system: ErrorSystem) -> Proof | None:
     """Return the first proposal that is proven; None where there is none."""
-    for proposal in proposals(system):
-        if proven(proposal.root, *system.multiplied(proposal.multipliers, proposal.gain), proposal.gain):
-            return proposal
-    return None
+    every = proposals(system)
+    return next((p for p in every if proven(p.root, *system.multiplied(p.multipliers, p.gain), p.gain)), None)
 
 
 def proven_gain(system: ErrorSystem) -> float:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,8 +30,6 @@ from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem, ReliftScales
 from .proof import proven_gain
-
-_OTHERS = (0.0, 1e-3)  # weights of other states' errors: with them the Riccati equation is better conditioned
 
 
 @frozen
@@ -126,13 +123,10 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
     """Return proven gains from what the channels act on, over sizes, to what they add to each of n errors."""
     if not len(acted):
         return np.zeros(n)
-    rest, top, gains = system.mismatch(), float(acted.max()), np.full(n, np.inf)
+    rest, top = system.mismatch(), float(acted.max())
     rest = replace(rest, B=rest.B * (acted / top), D=rest.D * (acted / top))  # else gains underflow where little moves
-    for j, others in product(range(n), _OTHERS):
-        if np.isinf(gains[j]):
-            weight = np.where(np.arange(len(rest.C)) == j, 1.0, others)[:, None]
-            gains[j] = proven_gain(replace(rest, C=weight * rest.C)) * top
-    return gains
+    alone = (np.arange(len(rest.C))[:, None] == j for j in range(n))
+    return np.array([proven_gain(replace(rest, C=one * rest.C)) * top for one in alone])
 
 
 @frozen

@@ -103,7 +103,7 @@ class HarmonicDrivePopulation(BatchSettings):
         super().__post_init__()
         object.__setattr__(self, "loop", member(Loop, self.loop, "Harmonic Drive population: the loop"))
         object.__setattr__(self, "conditions", tuple(self.conditions))
-        if sorted(self.conditions) not in ([c] if isinstance(c, str) else sorted(c) for c in (*CONDITIONS, CONDITIONS)):
+        if not self.conditions or sorted(self.conditions) != sorted({*self.conditions} & {*CONDITIONS}):
             wanted = f"should be one or both of {CONDITIONS}, each once"
             raise ConfigError(f"Harmonic Drive population: conditions {self.conditions} {wanted}.")
 

@@ -23,7 +23,6 @@ Y. Nesterov, A. Nemirovskii, *Interior-Point Polynomial Algorithms in Convex Pro
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum
@@ -33,7 +32,7 @@ import numpy as np
 from ...core.arrays import AnyArray, frozen
 from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 
-_SHRINK, _CENTRED, _STEPS = 0.3, 1.0, 400  # of mu once the decrement is below the second, and Newton steps at most
+_SHRINK, _CENTRED = 0.3, 1.0  # of mu once the decrement is below the second
 
 
 class Ending(str, Enum):
@@ -41,7 +40,7 @@ class Ending(str, Enum):
 
     SOLVED = "solved"
     INFEASIBLE = "infeasible"
-    TIME = "time limit"
+    STEPS = "limit of steps"
     STALLED = "no progress"
 
 
@@ -77,20 +76,20 @@ def minimise(
     start: AnyArray,
     *,
     rtol: float = 1e-5,
-    time_limit_s: float = 20.0,
+    steps: int = 400,
     box: float = 1e6,
 ) -> Outcome:
-    """Minimise over the matrix inequalities."""
-    programme = _Programme(c, blocks, np.full(len(c), box), time.perf_counter() + time_limit_s)
+    """Minimise over the matrix inequalities, with so many Newton steps at most, to a feasible point and from there."""
+    programme = _Programme(c, blocks, np.full(len(c), box))
     if not programme.holds(start):
-        feasible = _find_feasible(programme, start)
+        feasible = _find_feasible(programme, start, steps)
         if feasible.x is None:
             return feasible
         start = feasible.x
-    return _follow(programme, start, rtol)
+    return _follow(programme, start, rtol, steps)
 
 
-def _find_feasible(programme: _Programme, start: AnyArray) -> Outcome:
+def _find_feasible(programme: _Programme, start: AnyArray, steps: int) -> Outcome:
     """Minimise t subject to ``F_k + t I >= 0``, ``t >= -1``, until t is negative enough."""
     n, goal = len(start), np.append(np.zeros(len(start)), 1.0)
     lifted = [Block(np.ones((1, 1, 1)), goal[:, None, None, None])]
@@ -100,22 +99,19 @@ def _find_feasible(programme: _Programme, start: AnyArray) -> Outcome:
     worst = max(-float(np.linalg.eigvalsh(block.at(start)).min()) for block in programme.blocks)
     inside = np.clip(start, -0.9 * programme.box, 0.9 * programme.box)
     point = np.append(inside, 1.5 * max(worst, 0.0) + 1.0)
-    extended = _Programme(goal, lifted, np.append(programme.box, 10 * point[n]), programme.end)
-    outcome = _follow(extended, point, ITERATED, stop_below=0.0)
+    extended = _Programme(goal, lifted, np.append(programme.box, 10 * point[n]))
+    outcome = _follow(extended, point, ITERATED, steps, stop_below=0.0)
     if outcome.x is not None and outcome.x[n] < 0 and programme.holds(outcome.x[:n]):
         return replace(outcome, x=outcome.x[:n])
-    ending = Ending.TIME if outcome.ending is Ending.TIME else Ending.STALLED
+    ending = Ending.STEPS if outcome.ending is Ending.STEPS else Ending.STALLED
     return Outcome(None, np.inf, -np.inf, Ending.INFEASIBLE if outcome.lower > 0 else ending)
 
 
-def _follow(programme: _Programme, x: AnyArray, rtol: float, stop_below: float = -np.inf) -> Outcome:
+def _follow(programme: _Programme, x: AnyArray, rtol: float, steps: int, stop_below: float = -np.inf) -> Outcome:
     """Follow the central path from a point inside; with `stop_below` to a centred point clearly below it."""
     size = programme.size
     mu, lower, ending = max(abs(programme.value(x)), 1e-3) / size * 10, -np.inf, Ending.STALLED
-    for _ in range(_STEPS):
-        if time.perf_counter() > programme.end:
-            ending = Ending.TIME
-            break
+    for _ in range(steps):
         try:
             gradient, hessian, roots = programme.derivatives(x)
             gradient = programme.c / mu + gradient
@@ -137,17 +133,18 @@ def _follow(programme: _Programme, x: AnyArray, rtol: float, stop_below: float =
             break
         x = x + step * direction
         mu = mu * _SHRINK if decrement < _CENTRED else mu
+    else:
+        ending = Ending.STEPS
     return Outcome(x, programme.value(x), lower, ending)
 
 
 @frozen
 class _Programme:
-    """``min c'x`` subject to the blocks and ``|x_i| <= box_i``, until a time of the performance counter."""
+    """``min c'x`` subject to the blocks and ``|x_i| <= box_i``."""
 
     c: AnyArray
     blocks: Sequence[Block]
     box: AnyArray
-    end: float
 
     @property
     def size(self) -> int:

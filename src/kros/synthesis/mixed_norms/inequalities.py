@@ -27,6 +27,8 @@ X, Y, A_n, B_n, C_n, D_n, Z : the variables
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from ...core.arrays import AnyArray, frozen
@@ -72,7 +74,7 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     L = K.B - plant.B2 @ K.D  # predictor gain: e+ = (A - L C2) e + ...
     A = np.block([[plant.A - L @ plant.C2, np.zeros((n, n))], [K.B @ plant.C2, K.A + K.B @ plant.C2]])
     P = gramian(A, np.vstack([plant.B1 - L @ plant.D21, K.B @ plant.D21]), plant.dt)
-    E, X = P[:n, :n], P[:n, :n] + P[:n, n:] + P[n:, :n] + P[n:, n:]
+    E, X = P[:n, :n], P.reshape(2, n, 2, n).sum(axis=(0, 2))
     X = X + _KNOWN**2 * np.diag(np.where(np.diag(X) > 0, 0.0, np.diag(X).max(initial=1.0)))
     E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > EPS**2 * np.diag(X), 0.0, np.diag(X)))
     T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)
@@ -106,41 +108,39 @@ class MixedInequalities:
         }
         return shapes | {"Dn": (n_u, n_y, False), "Z": (n_z1, n_z1, True)}
 
+    @cached_property
+    def places(self) -> Values:
+        """Number of the scalar variable behind every entry of every variable."""
+        places, size = {}, 0
+        for name, (rows, columns, symmetric) in self.shapes.items():
+            place = np.arange(rows * columns).reshape(rows, columns)
+            if symmetric:
+                upper, place = np.triu_indices(rows), np.zeros((rows, rows), int)
+                place[upper] = np.arange(len(upper[0]))
+                place = np.maximum(place, place.T)
+            places[name] = size + place
+            size += place.max(initial=-1) + 1
+        return places
+
     @property
     def size(self) -> int:
         """Number of scalar variables."""
-        return sum(_count(*shape) for shape in self.shapes.values())
+        return 1 + max(place.max(initial=-1) for place in self.places.values())
 
     def values(self, x: AnyArray) -> Values:
         """Matrices from scalar variables, shape (..., n); the leading axes stay."""
-        matrices, position = {}, 0
-        for name, (rows, columns, symmetric) in self.shapes.items():
-            part = x[..., position : position + _count(rows, columns, symmetric)]
-            position += part.shape[-1]
-            if symmetric:
-                matrix = np.zeros((*x.shape[:-1], rows, columns))
-                upper = np.triu_indices(rows)
-                matrix[..., upper[0], upper[1]] = part
-                matrix[..., upper[1], upper[0]] = part
-            else:
-                matrix = part.reshape(*x.shape[:-1], rows, columns)
-            matrices[name] = matrix
-        return matrices
+        return {name: x[..., place] for name, place in self.places.items()}
 
     def start(self) -> AnyArray:
         """Variables of no correction, with the Lyapunov matrices that are expected."""
-        values = {name: np.zeros(shape[:2]) for name, shape in self.shapes.items()}
-        values["X"] = values["Y"] = 2 * np.diag(self.balanced.spread)
-        values["Z"] = 2 * np.eye(len(values["Z"]))
-        parts = [
-            values[k][np.triu_indices(rows)] if symmetric else values[k].ravel()
-            for k, (rows, _, symmetric) in self.shapes.items()
-        ]
-        return np.concatenate(parts)
+        x, places = np.zeros(self.size), self.places
+        x[places["X"]] = x[places["Y"]] = 2 * np.diag(self.balanced.spread)
+        x[places["Z"]] = 2 * np.eye(len(places["Z"]))
+        return x
 
     def objective(self) -> AnyArray:
         """Coefficients of tr Z."""
-        return np.trace(self.values(np.eye(self.size))["Z"], axis1=-2, axis2=-1)
+        return np.bincount(np.diag(self.places["Z"]), minlength=self.size).astype(float)
 
     def blocks(self) -> list[Block]:
         """Return the inequalities as affine functions of the scalar variables."""
@@ -198,10 +198,6 @@ class MixedInequalities:
         middle = v["An"] + eye - V @ B @ p.C2 @ X - Y @ p.B2 @ C @ U - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
         A = np.linalg.solve(V, np.linalg.solve(U.T, middle.T).T)
         return self.balanced.controller(StateSpace(A, B, C, Dn, p.dt))
-
-
-def _count(rows: int, columns: int, symmetric: bool) -> int:
-    return rows * (rows + 1) // 2 if symmetric else rows * columns
 
 
 def _blocks(rows: list[list[AnyArray]]) -> AnyArray:

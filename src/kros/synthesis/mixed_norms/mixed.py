@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.errors import ConfigError, SynthesisError
-from ...core.lti import StateSpace, gain
+from ...core.errors import SynthesisError
+from ...core.lti import StateSpace
 from ...core.norms import gramian_root, h2_norm, hinf_norm
 from ...core.rounding import ITERATED
 from ...core.settings import require_kind
@@ -29,17 +29,17 @@ from .inequalities import MixedInequalities, balance
 
 _ACCURACY = 1e-4  # of the inequalities' optimum, relative
 _STATES = 8  # of the plant in the inequalities, at most: their cost grows with the sixth power of the states
-_REMEDY = "raise noise, penalty or the time limit"
+_REMEDY = "raise noise, penalty or the number of steps"
 
 
-def mixed(problem: ObserverProblem, *, time_limit_s: float = 20.0) -> Synthesis:
+def mixed(problem: ObserverProblem, *, steps: int = 400) -> Synthesis:
     """Return the paper's observer filter, from a reduced and regularised plant, certified on the set itself.
 
     Parameters
     ----------
     problem : ObserverProblem
-    time_limit_s : float, s
-        For the inequalities; the best filter at that time is returned.
+    steps : int
+        Newton steps for the inequalities, at most; the filter of the last one is returned.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def mixed(problem: ObserverProblem, *, time_limit_s: float = 20.0) -> Synthesis:
     Raises
     ------
     ConfigError
-        When it is no observer problem, or the time limit is not positive.
+        When it is no observer problem.
     SynthesisError
         When the problem is not sound (`ObserverProblem.require_sound`), or the filter does not survive verification
         (with the reason).
@@ -65,18 +65,15 @@ def mixed(problem: ObserverProblem, *, time_limit_s: float = 20.0) -> Synthesis:
     (True, True)
     """
     require_kind(problem, ObserverProblem, "Mixed synthesis", "build one, or use h2 or hinf for a generalized plant")
-    if not time_limit_s > 0:
-        raise ConfigError(f"Mixed synthesis: time_limit_s = {time_limit_s} should be positive.")
     start = time.perf_counter()
     problem.require_sound()
-    nothing = gain(np.zeros((problem.correction_size, len(problem.C))), problem.nominal.dt)
-    idle = certified(problem, nothing, "mixed")
+    idle = certified(problem, problem.nothing, "mixed")
     if idle.worst_case_h2 == 0:
         note = "No model of the set differs from the nominal one: without correction there is no error."
         return replace(idle, status=Status.OPTIMAL, lower_bound=0.0, notes=(note,))
     plant = mixed_plant(problem)
-    peak = hinf_norm(plant.channel(plant.rows(2), plant.columns(1)).close(nothing)) or 1.0
-    best = by_inequalities(scaled(plant, peak), time_limit_s)
+    peak = hinf_norm(plant.channel(plant.rows(2), plant.columns(1)).close(problem.nothing)) or 1.0
+    best = by_inequalities(scaled(plant, peak), steps)
     result = certified(problem, problem.to_physical(best.controller), "mixed")
     notes = [
         "T11 contains the measurement noise only and T22 does not depend on K; worst_case_h2 is the meaningful number. "
@@ -95,12 +92,12 @@ def scaled(plant: GeneralizedPlant, a: float) -> GeneralizedPlant:
     return plant.transformed(z=np.diag(z), w=np.diag(w))
 
 
-def by_inequalities(plant: GeneralizedPlant, time_limit_s: float = 20.0) -> Synthesis:
+def by_inequalities(plant: GeneralizedPlant, steps: int = 400) -> Synthesis:
     """Return the controller of a plant (D22 = 0) from the inequalities of its reduced model, verified on all of it."""
     small, reduced = _reduced(plant)
     inequalities = MixedInequalities(balance(small))
     parts = inequalities.objective(), inequalities.blocks(), inequalities.start()
-    solved = minimise(*parts, rtol=_ACCURACY, time_limit_s=time_limit_s)
+    solved = minimise(*parts, rtol=_ACCURACY, steps=steps)
     if solved.x is None or not np.isfinite(solved.value):
         raise SynthesisError(f"Mixed synthesis: the inequalities have no solution, {solved.ending.value}; {_REMEDY}.")
     bound = inequalities.balanced.size * np.sqrt(max(solved.value, 0.0))

@@ -42,8 +42,6 @@ def interconnect(
 
 def _matrix(rows: Mapping[str, Sum], heights: Mapping[str, int], widths: Mapping[str, int]) -> AnyArray:
     """Stack the matrices of all sums, zero where a sum does not name a source."""
-    if not heights or not widths:
-        return np.zeros((sum(heights.values()), sum(widths.values())))
     return np.block(
         [
             [rows.get(name, {}).get(source, np.zeros((height, width))) for source, width in widths.items()]

@@ -6,9 +6,28 @@ With uncertainty of any of the six forms, ``E = W_L Delta W_R`` on scaled signal
 .. math:: e = T_e W_L\,\Delta (I - N \Delta)^{-1} M w_1 + S R\,W_u w_1 \; - \; S\,(zI - A)^{-1} J K\, n
 
 with :math:`S = (I + (zI - A)^{-1} J K C)^{-1}` and ``J = B`` (input injection) or ``J = I`` (state injection). ``T_e``
-is ``S`` or ``S G``, and M and N, which do not contain K, depend on the form, see `uncertainty_location`. K is outside
-the loop of :math:`\Delta`, so no choice of K can lose robustness, and none can gain it: the set is well posed when
-``||N|| < 1``. The diagram is in `plants`.
+is ``S`` or ``S G``, and M and N, which do not contain K, depend on the form. K is outside the loop of :math:`\Delta`,
+so no choice of K can lose robustness, and none can gain it: the set is well posed when ``||N|| < 1``. The generalized
+plant is drawn in `plants`. With ``G`` the nominal model from input to state and ``w2 = Delta z2``,
+
+::
+
+                        +-------------- inverse ---------------+
+                        v                                      |
+     u' ------+------->(+)--> W_R --> z2 --> Delta --> w2 --> W_L --+--> at the input:  x = G (u' + W_L w2)
+              |         ^                                           |
+              +--> G ---+   (sees the state)                        +--> at the state:  x = G u' + W_L w2
+
+=============================  =========  ========  =======  =====  ===============  ===========  =====================
+form                           acts at    sees      inverse  T_e    M                N            robust when
+=============================  =========  ========  =======  =====  ===============  ===========  =====================
+additive                       state      input     no       S      W_R W_u          0            always
+input multiplicative           input      input     no       S G    W_R W_u          0            always
+output multiplicative          state      state     no       S      W_R G W_u        0            always
+inverse additive               input      state     yes      S G    W_R G W_u        W_R G W_L    ``||N|| < 1``
+inverse input multiplicative   input      input     yes      S G    W_R W_u          W_R W_L      ``||N|| < 1``
+inverse output multiplicative  state      state     yes      S      W_R G W_u        W_R W_L      ``||N|| < 1``
+=============================  =========  ========  =======  =====  ===============  ===========  =====================
 
 Everything numerical happens in scaled coordinates: states over `output_scale`, inputs over `input_scale`, measurements
 over their noise.
@@ -21,6 +40,7 @@ A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -37,7 +57,6 @@ from ..assumptions import require_detectable
 from ..generalized_plant import GeneralizedPlant
 from ..result import Injection
 from .interconnect import interconnect
-from .uncertainty_location import LOCATIONS, UncertaintyLocation
 
 if TYPE_CHECKING:
     from ...identify.model_set import ModelSet
@@ -120,7 +139,7 @@ class ObserverProblem:
                 object.__setattr__(self, name, weight)
                 size = weight.n_outputs, weight.n_inputs
                 fits = size == (height or size[0], width or size[1]) and not weight.batch_shape
-                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {as_form(self.form).value}"
+                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {self.location.value}"
                 shape = f"{size[0]} x {size[1]}{weight.batch_shape or ''}"
                 self._require(fits, f"{wanted} uncertainty, found {shape}")
                 self._require(weight.dt == dt, f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s")
@@ -157,8 +176,8 @@ class ObserverProblem:
             output_scale=models.output_scale,
             noise=np.asarray(noise, dtype=float),
             n_original=models.lifting.n_states,
-            remainder_left=remainder.left if remainder is not None else None,
-            remainder_right=remainder.right if remainder is not None else None,
+            remainder_left=getattr(remainder, "left", None),
+            remainder_right=getattr(remainder, "right", None),
             form=uncertain.form,
         )
         freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)]
@@ -169,14 +188,20 @@ class ObserverProblem:
         return case
 
     @property
-    def location(self) -> UncertaintyLocation:
-        """Where the perturbation acts and what it sees."""
-        return LOCATIONS[as_form(self.form)]
+    def location(self) -> Form:
+        """The form: where the perturbation acts and what it sees."""
+        return Form(self.form)
 
     @property
     def input_weight(self) -> StateSpace:
         """W_u, the identity unless given."""
         return self.W_u if self.W_u is not None else gain(np.eye(self.nominal.n_inputs), self.nominal.dt)
+
+    @property
+    def remainder(self) -> tuple[StateSpace, StateSpace] | None:
+        """Weights of the additive remainder: of what it does, and of what it sees of white inputs."""
+        left, right = self.remainder_left, self.remainder_right
+        return None if left is None or right is None else (left, right @ self.input_weight)
 
     @cached_property
     def scaled(self) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
@@ -194,12 +219,16 @@ class ObserverProblem:
     @cached_property
     def M(self) -> StateSpace:  # noqa: N802
         """From the disturbance w1 to what Delta sees."""
-        return self.location.M(self.W_R, self.scaled_model, self.input_weight)
+        seen = self.input_weight
+        return self.W_R @ (seen if self.location.sees_input else self.scaled_model @ seen)
 
     @cached_property
     def N(self) -> StateSpace | None:  # noqa: N802
         """From what Delta does to what it sees; None for the forms without a loop."""
-        return self.location.N(self.W_R, self.scaled_model, self.W_L)
+        form, G = self.location, self.scaled_model
+        if not form.inverse:
+            return None
+        return self.W_R @ (self.W_L if form.at_input is form.sees_input else G @ self.W_L)
 
     @property
     def injection_matrix(self) -> AnyArray:
@@ -208,15 +237,9 @@ class ObserverProblem:
         return B if self.injection is Injection.INPUT else np.eye(len(A))
 
     @property
-    def correction_size(self) -> int:
-        """Number of outputs of K, the signals of the correction."""
-        return self.nominal.n_inputs if self.injection is Injection.INPUT else self.nominal.n_states
-
-    @property
-    def uncertainty_input(self) -> slice:
-        """Columns of `error_system` at which ``W_L w2`` acts."""
-        m, n = self.nominal.n_inputs, self.nominal.n_states
-        return slice(0, m) if self.location.at_input else slice(m, m + n)
+    def nothing(self) -> StateSpace:
+        """The controller that corrects nothing."""
+        return gain(np.zeros((self.injection_matrix.shape[1], len(self.C))), self.nominal.dt)
 
     def require_sound(self) -> float:
         """Check that the set is well posed and the observer possible; return ``||N||``, zero without a loop.
@@ -241,8 +264,8 @@ class ObserverProblem:
         size = 0.0 if self.N is None else hinf_norm(self.N)
         if size >= 1:
             raise SynthesisError(
-                f"Observer synthesis: ||{self.location.N_name}|| = {size:.6g} should be below 1 for "
-                f"{as_form(self.form).value.replace('_', ' ')} uncertainty, otherwise the set contains ill-posed "
+                f"Observer synthesis: ||N|| = {size:.6g} should be below 1 for "
+                f"{self.location.value.replace('_', ' ')} uncertainty, otherwise the set contains ill-posed "
                 "plants; choose another form or nominal, or leave outliers out."
             )
         return size
@@ -269,11 +292,6 @@ class ObserverProblem:
         """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
         return self.error_plant().close(self.to_scaled(controller))
 
-    @property
-    def error_inputs(self) -> int:
-        """Number of the signals (d, r, n, v) that drive an error system; behind them the input may follow."""
-        return self.nominal.n_inputs + 2 * self.nominal.n_states + len(self.C)
-
     def estimate_error(self, estimate: StateSpace) -> StateSpace:
         """Error system from (d, r, n, v, s), scaled, to W_p e, for an estimate that nothing is fed back to.
 
@@ -282,8 +300,8 @@ class ObserverProblem:
         """
         A, B, C, W_p = self.scaled
         n, m, q, eye, dt = len(A), B.shape[1], len(C), np.eye, self.nominal.dt
-        sizes = np.diag([*self.noise, *self.output_scale, *self.input_scale])
-        filters = gain(np.diag(1 / self.output_scale), dt) @ estimate @ gain(sizes, dt)
+        sizes = np.concatenate([self.noise, self.output_scale, self.input_scale])
+        filters = _scaled(estimate, 1 / self.output_scale, sizes)
         truth = np.vstack([C, eye(n), np.zeros((m, n))])
         columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
         plant = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt)
@@ -301,10 +319,15 @@ class ObserverProblem:
 
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
-        (correction, noise), dt = self._scales, self.nominal.dt
-        return gain(np.diag(1 / correction), dt) @ controller @ gain(np.diag(noise), dt)
+        correction, noise = self._scales
+        return _scaled(controller, 1 / correction, noise)
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
-        (correction, noise), dt = self._scales, self.nominal.dt
-        return gain(np.diag(correction), dt) @ controller @ gain(np.diag(1 / noise), dt)
+        correction, noise = self._scales
+        return _scaled(controller, correction, 1 / noise)
+
+
+def _scaled(system: StateSpace, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
+    """Return a system with outputs and inputs multiplied."""
+    return replace(system, B=system.B * inputs, C=outputs[:, None] * system.C, D=outputs[:, None] * system.D * inputs)

@@ -1,6 +1,6 @@
 r"""Generalized plants of the observer problem, in scaled coordinates.
 
-For every form, with the perturbed plant in it (`uncertainty_location`) and the observer (18)-(21) beside it::
+For every form, with the perturbed plant in it (`observer_problem`) and the observer (18)-(21) beside it::
 
     w1 -> W_u -+-> s                       s, or x = G (s + [W_L w2]) + [W_L w2] -> W_R -> z2 ... Delta ... w2
                |                                   (what an inverse form sees contains W_L w2)
@@ -40,40 +40,31 @@ _LEAST_NOISE, _PENALTY = 1e-3, 3e-2
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); brackets for remainder and process noise."""
-    A, B, C, W_p = problem.scaled
-    location, J, eye = problem.location, problem.injection_matrix, np.eye
-    n, m, q = len(A), B.shape[1], len(C)
-    whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), problem.nominal.dt)
-    blocks = {"error": whole, "W_u": problem.input_weight}
-    blocks |= {"W_L": problem.W_L, "W_R": problem.W_R}
-    inputs = {"w1": m, "w2": problem.W_L.n_inputs}
-    error = {"error": eye(n)} | ({} if location.at_input else {"W_L": eye(n)})
-    drive = {"u": -J} | ({"W_L": B} if location.at_input else {})
-    own = {"W_L": eye(problem.W_L.n_outputs)} if location.inverse else {}
-    seen = {"W_u": eye(m)} if location.sees_input else {"plant": eye(n)}
+    location, plant, eye = problem.location, problem.error_plant(), np.eye
+    error, (n, _, n_u, n_z, q), m = plant.open_loop(), plant.sizes, problem.nominal.n_inputs
+    d, r, noise, v, u = np.split(eye(error.n_inputs), np.cumsum([m, n, q, n]), axis=1)
+    z, y = np.split(eye(error.n_outputs), [n_z])
+    blocks = {"error": error, "W_u": problem.input_weight, "W_L": problem.W_L, "W_R": problem.W_R}
+    inputs, acts = {"w1": m, "w2": problem.W_L.n_inputs}, {"W_L": eye(problem.W_L.n_outputs)}
     wires: dict[str, dict[str, AnyArray]] = {"W_u": {"w1": eye(m)}, "W_L": {"w2": eye(inputs["w2"])}}
     if not location.sees_input:
-        blocks["plant"] = whole
-        wires["plant"] = {"W_u": B} | ({"W_L": B} if location.inverse and location.at_input else {})
-    wires["W_R"] = seen | (own if location.at_input is location.sees_input else {})
-    outputs = {"z2": {"W_R": eye(problem.W_R.n_outputs)}}
+        blocks["plant"] = problem.scaled_model
+        wires["plant"] = {"W_u": eye(m)} | (acts if location.inverse and location.at_input else {})
+    seen = {"W_u": eye(m)} if location.sees_input else {"plant": eye(n)}
+    wires["W_R"] = seen | (acts if location.inverse and location.at_input is location.sees_input else {})
+    wires["error"] = {"W_L": d if location.at_input else r, "n": noise, "u": u}
+    outputs = {"z1": {"error": z}, "z2": {"W_R": eye(problem.W_R.n_outputs)}}
     if problem.remainder_left is not None and problem.remainder_right is not None:
         blocks |= {"W_rL": problem.remainder_left, "W_rR": problem.remainder_right}
         inputs["w3"] = problem.remainder_left.n_inputs
         wires |= {"W_rL": {"w3": eye(inputs["w3"])}, "W_rR": {"W_u": eye(m)}}
         outputs["z3"] = {"W_rR": eye(problem.remainder_right.n_outputs)}
-        error["W_rL"] = eye(n)
+        wires["error"]["W_rL"] = r
     inputs["n"] = q
     if problem.scaled_process_noise.any():
-        inputs["v"] = n
-        drive["v"] = np.diag(problem.scaled_process_noise)
-    wires["error"] = drive
-    performance, measured = ({name: rows @ matrix for name, matrix in error.items()} for rows in (W_p, C))
-    outputs = {"z1": performance} | outputs
-    whole_outputs = outputs | {"y": measured | {"n": eye(q)}}
-    system = interconnect(blocks, wires, inputs | {"u": J.shape[1]}, whole_outputs)
-    sizes = [next(iter(row.values())).shape[0] for row in outputs.values()]
-    return split(system, sum(inputs.values()), sum(sizes), n_w1=m, n_z1=sizes[0])
+        inputs["v"], wires["error"]["v"] = n, v
+    system = interconnect(blocks, wires, inputs | {"u": n_u}, outputs | {"y": {"error": y}})
+    return split(system, sum(inputs.values()), system.n_outputs - q, n_w1=m, n_z1=n_z)
 
 
 def disturbed(problem: ObserverProblem, d: StateSpace, remainder: StateSpace | None) -> tuple[StateSpace, StateSpace]:
@@ -112,10 +103,6 @@ def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
 
 def penalise(plant: GeneralizedPlant, penalty: float) -> GeneralizedPlant:
     """Append the weighted control to the performance outputs."""
-    n, n_w, n_u, _, _ = plant.sizes
-    return replace(
-        plant,
-        C1=np.vstack([plant.C1, np.zeros((n_u, n))]),
-        D11=np.vstack([plant.D11, np.zeros((n_u, n_w))]),
-        D12=np.vstack([plant.D12, penalty * np.eye(n_u)]),
-    )
+    more = (0, plant.sizes[2]), (0, 0)
+    D12 = np.vstack([plant.D12, penalty * np.eye(plant.sizes[2])])
+    return replace(plant, C1=np.pad(plant.C1, more), D11=np.pad(plant.D11, more), D12=D12)

@@ -15,13 +15,13 @@ mean spectrum it minimises the mean square error over the units.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Index, frozen
+from ...core.arrays import AnyArray, Array, Flags, frozen
 from ...core.errors import SynthesisError
-from ...core.lti import StateSpace, gain
+from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import gramian, gramian_root, h2_norm
 from ...core.rounding import ROUNDING, TINY
 from ..result import Injection, Status, Synthesis, enclosed
@@ -40,27 +40,25 @@ class ResidualProblem:
     noise: Array  # (q,), standard deviation of the measurement noise
     scale: Array  # (n,), range of every state; norms are of errors in these units
     dt: float  # s
+    basis: Basis = field(default_factory=Basis)  # of the shaping filter
 
-    def __post_init__(self) -> None:
-        for name in ("A", "C", "noise", "scale"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
-
-    def scaled(self, basis: Basis) -> _Scaled:
-        """Return the problem in scaled coordinates, for a basis of the shaping filter."""
-        x = self.scale
-        return _Scaled(self.A / x[:, None] * x, self.C * x, self.noise, self.spectra / np.outer(x, x), basis, self.dt)
+    @property
+    def scaled(self) -> _Scaled:
+        """The problem in scaled coordinates."""
+        x, n = self.scale, len(self.A)
+        plant = StateSpace(self.A / x[:, None] * x, np.eye(n), self.C * x, np.zeros((len(self.C), n)), self.dt)
+        return _Scaled(plant, self.noise, self.spectra / np.outer(x, x), self.basis)
 
 
 def residual_h2(
     problem: ResidualProblem,
-    basis: Basis | None = None,
     tolerance_percent: float = 1.0,
     n_lifted: int | None = None,
     max_order: int | None = None,
 ) -> Synthesis:
     """Return the correction that is optimal for residuals; reducing its order costs each hidden state the tolerance."""
     start = time.perf_counter()
-    shaped = problem.scaled(basis or Basis())
+    shaped = problem.scaled
     full = shaped.filter()
     K = shaped.correction(full)
     if not np.isfinite(shaped.norm(full, K)):
@@ -69,7 +67,7 @@ def residual_h2(
         )
     K = shaped.reduced(full, K, tolerance_percent, full.n_states if max_order is None else max_order)
     norm = shaped.norm(full, K)
-    note = f"mean of {len(shaped.spectra)} units, {shaped.basis.delays} delays, lags {shaped.basis.poles}"
+    note = f"mean of {len(shaped.spectra)} units, {problem.basis.delays} delays, lags {problem.basis.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
     lower, gap, notes = enclosed(norm, shaped.lower_bound(full))
     n = len(problem.A)
@@ -91,11 +89,11 @@ def residual_h2(
 
 def promised_errors(problem: ResidualProblem) -> Array:
     """Return the RMS error of every state, a share of its largest value, on the spectra as measured."""
-    shaped = problem.scaled(Basis())
+    shaped = problem.scaled
     try:
         K = shaped.correction(shaped.filter())
     except SynthesisError:
-        return np.full(len(shaped.A), np.inf)
+        return np.full(len(problem.A), np.inf)
     return np.sqrt(shaped.unit_errors(K).mean(axis=0))
 
 
@@ -103,65 +101,51 @@ def promised_errors(problem: ResidualProblem) -> Array:
 class _Scaled:
     """The problem in scaled coordinates."""
 
-    A: Array
-    C: Array
+    plant: StateSpace  # from the residual omega to the measurements, whose states are the errors
     noise: Array
     spectra: AnyArray
     basis: Basis
-    dt: float
 
     def filter(self) -> StateSpace:
         """Shaping filter of the units' mean spectrum."""
-        return shaping_filter(self.spectra.mean(axis=0), self.basis, self.dt)
-
-    def shaped(self, shaping: StateSpace) -> tuple[Array, Array, Array]:
-        """Plant behind its shaping filter: dynamics, input of the white noise, measurement."""
-        A = np.block([[self.A, shaping.C], [np.zeros((shaping.n_states, len(self.A))), shaping.A]])
-        return A, np.vstack([shaping.D, shaping.B]), np.hstack([self.C, np.zeros((len(self.C), shaping.n_states))])
+        return shaping_filter(self.spectra.mean(axis=0), self.basis, self.plant.dt)
 
     def lower_bound(self, shaping: StateSpace) -> float:
         """Root mean square of the scaled error that no correction falls below."""
-        A, G, C = self.shaped(shaping)
-        (n, k), q = G.shape, len(C)
-        B, D = np.hstack([G, np.zeros((n, q))]), np.hstack([np.zeros((q, k)), np.diag(self.noise)])
-        return float(np.sqrt(predictor_bound(A, B, C, D, np.eye(len(self.A), n))))
+        whole, q = self.plant @ shaping, len(self.noise)
+        B, D = np.hstack([whole.B, np.zeros((whole.n_states, q))]), np.hstack([whole.D, np.diag(self.noise)])
+        Z = np.eye(self.plant.n_states, whole.n_states)
+        return float(np.sqrt(predictor_bound(whole.A, B, whole.C, D, Z)))
 
     def correction(self, shaping: StateSpace) -> StateSpace:
         """Kalman gains of plant and shaping filter as a correction filter."""
-        n = len(self.A)
-        A, G, C = self.shaped(shaping)
-        L = kalman(A, C, G @ G.T, np.diag(self.noise**2), self.dt).controller.D
-        return StateSpace(shaping.A, L[n:], shaping.C, L[:n], self.dt)
+        n, whole = self.plant.n_states, self.plant @ shaping
+        L = kalman(whole.A, whole.C, whole.B @ whole.B.T, np.diag(self.noise**2), whole.dt).controller.D
+        return StateSpace(shaping.A, L[n:], shaping.C, L[:n], shaping.dt)
 
     def error_system(self, K: StateSpace) -> StateSpace:
         """From (omega, white noise of unit variance) to the error e."""
-        n, root = len(self.A), np.diag(self.noise)
-        A = np.block([[self.A - K.D @ self.C, -K.C], [K.B @ self.C, K.A]])
+        n, C, root = self.plant.n_states, self.plant.C, np.diag(self.noise)
+        A = np.block([[self.plant.A - K.D @ C, -K.C], [K.B @ C, K.A]])
         B = np.block([[np.eye(n), -K.D @ root], [np.zeros((K.n_states, n)), K.B @ root]])
-        return StateSpace(A, B, np.eye(n, len(A)), np.zeros((n, B.shape[1])), self.dt)
+        return StateSpace(A, B, np.eye(n, len(A)), np.zeros((n, B.shape[1])), K.dt)
 
     def loop(self, shaping: StateSpace, K: StateSpace) -> StateSpace:
         """From white noise of unit variance to the error, omega made by a shaping filter."""
-        error, n = self.error_system(K), len(self.A)
-        drive, rest = error.B[:, :n], error.B[:, n:]
-        A = np.block([[error.A, drive @ shaping.C], [np.zeros((shaping.n_states, error.n_states)), shaping.A]])
-        B = np.block([[drive @ shaping.D, rest], [shaping.B, np.zeros((shaping.n_states, rest.shape[1]))]])
-        return StateSpace(
-            A, B, np.hstack([error.C, np.zeros((n, shaping.n_states))]), np.zeros((n, B.shape[1])), self.dt
-        )
+        return self.error_system(K) @ block_diagonal([shaping, gain(np.eye(len(self.noise)), K.dt)])
 
     @property
-    def hidden(self) -> Index:
+    def hidden(self) -> Flags:
         """States that are not measured; all where none is hidden."""
-        measured = np.any(self.C, axis=0)
-        return np.flatnonzero(~measured) if not measured.all() else np.arange(len(self.A))
+        measured = np.any(self.plant.C, axis=0)
+        return ~measured | measured.all()
 
     def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
         """Root mean square of every state's scaled error, (n,), infinite where the error dynamics are unstable."""
         loop = self.loop(shaping, K)
         if not loop.is_stable():
-            return np.full(len(self.A), np.inf)
-        return np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), TINY))
+            return np.full(loop.n_outputs, np.inf)
+        return np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, loop.dt) @ loop.C.T), TINY))
 
     def norm(self, shaping: StateSpace, K: StateSpace) -> float:
         """Root mean square of the scaled error."""
@@ -169,10 +153,9 @@ class _Scaled:
 
     def unit_errors(self, K: StateSpace) -> Array:
         """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
-        f, n = self.spectra.shape[1], len(self.A)
-        response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / self.dt, f))
-        weight = circle_weights(f)
-        drive, rest = response[..., :n], response[..., n:]
+        f, n = self.spectra.shape[1:3]
+        response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / K.dt, f))
+        weight, drive, rest = circle_weights(f), response[..., :n], response[..., n:]
         driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real
         return driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2)
 

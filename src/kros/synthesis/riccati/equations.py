@@ -16,6 +16,7 @@ from ...core.arrays import AnyArray
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ITERATED, SINGULAR, TINY
+from ..generalized_plant import GeneralizedPlant
 
 
 def solve_riccati(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray, dt: float, method: str) -> AnyArray:
@@ -80,6 +81,13 @@ def _doubling(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray) -
     except np.linalg.LinAlgError:
         return None
     return None
+
+
+def riccati_pair(p: GeneralizedPlant, method: str) -> tuple[AnyArray, AnyArray]:
+    """Return the solutions of the control and filter Riccati equations of a plant's H2 problem."""
+    X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, f"{method}, control")
+    Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, p.D21 @ p.D21.T, p.B1 @ p.D21.T, p.dt, f"{method}, filter")
+    return X, Y
 
 
 def absorb_feedthrough(K: StateSpace, D22: AnyArray) -> StateSpace:

@@ -33,7 +33,7 @@ from ...core.rounding import ROUNDING
 from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Status, Synthesis
-from .equations import absorb_feedthrough, solve_riccati
+from .equations import absorb_feedthrough, riccati_pair
 
 _AGREEMENT = 1e-4  # of the norm with its promise
 
@@ -94,19 +94,14 @@ def h2(plant: GeneralizedPlant) -> Synthesis:
 
 def _optimum(p: GeneralizedPlant) -> tuple[StateSpace, float, float]:
     """Return the optimal controller for D22 = 0, its norm by the Riccati solutions, and the rounding of that norm."""
-    R, S = p.D12.T @ p.D12, p.D21 @ p.D21.T
-    X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, R, p.C1.T @ p.D12, p.dt, "H2 synthesis, control")
-    Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, S, p.B1 @ p.D21.T, p.dt, "H2 synthesis, filter")
-    if p.dt == 0:
-        F = -np.linalg.solve(R, p.B2.T @ X + p.D12.T @ p.C1)
-        L = np.linalg.solve(S, p.C2 @ Y + p.D21 @ p.B1.T).T
-        F0, L0 = np.zeros((len(R), p.sizes[1])), np.zeros((len(R), len(S)))
-    else:
-        R, S = R + p.B2.T @ X @ p.B2, S + p.C2 @ Y @ p.C2.T
-        F = -np.linalg.solve(R, p.B2.T @ X @ p.A + p.D12.T @ p.C1)
-        F0 = -np.linalg.solve(R, p.B2.T @ X @ p.B1 + p.D12.T @ p.D11)
-        L = np.linalg.solve(S, p.C2 @ Y @ p.A.T + p.D21 @ p.B1.T).T
-        L0 = np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T
+    X, Y = riccati_pair(p, "H2 synthesis")
+    sampled = float(p.dt > 0)  # in continuous time nothing is known of the same moment
+    ahead = p.A if sampled else np.eye(len(p.A))
+    R, S = p.D12.T @ p.D12 + sampled * (p.B2.T @ X @ p.B2), p.D21 @ p.D21.T + sampled * (p.C2 @ Y @ p.C2.T)
+    F = -np.linalg.solve(R, p.B2.T @ X @ ahead + p.D12.T @ p.C1)
+    F0 = -sampled * np.linalg.solve(R, p.B2.T @ X @ p.B1 + p.D12.T @ p.D11)
+    L = np.linalg.solve(S, p.C2 @ Y @ ahead.T + p.D21 @ p.B1.T).T
+    L0 = sampled * np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T
     C = F - L0 @ p.C2
     K = StateSpace(p.A - L @ p.C2 + p.B2 @ C, L + p.B2 @ L0, C, L0, p.dt)
     terms = [np.trace(p.D11.T @ p.D11 + p.B1.T @ X @ p.B1), -np.trace(F0.T @ R @ F0)]  # of full information

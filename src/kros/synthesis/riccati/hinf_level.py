@@ -32,7 +32,7 @@ from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ...core.rounding import EPS, SINGULAR, TINY
 from ..generalized_plant import GeneralizedPlant, split
-from .equations import absorb_feedthrough, balancing, solve_riccati
+from .equations import absorb_feedthrough, balancing, riccati_pair
 
 _DOUBT = float(np.sqrt(EPS))  # relative: conditions that hold or fail by less than this decide nothing
 
@@ -151,9 +151,7 @@ def scale(plant: GeneralizedPlant) -> GeneralizedPlant:
 
 def _even(p: GeneralizedPlant) -> GeneralizedPlant:
     """Return the plant in coordinates that balance the Riccati solutions of its H2 problem."""
-    method = "H-infinity synthesis, balancing"
-    X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, method)
-    Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, p.D21 @ p.D21.T, p.B1 @ p.D21.T, p.dt, method)
+    X, Y = riccati_pair(p, "H-infinity synthesis, balancing")
     left, right, _ = balancing(_root(Y, _size(p.A, p.B1)), _root(X, _size(p.A, p.C1)))
     return p.transformed(x=(left, right))
 

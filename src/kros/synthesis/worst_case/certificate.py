@@ -35,14 +35,11 @@ _ACCURACY = 1e-5  # of the quadrature, relative; a hundred times as much for wha
 
 def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) -> AnyArray:
     """Certified worst-case power density of ``W_p e``, shape (f,), for the error system from (d, r, n, v[, s])."""
-    m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response, T, certain, noise = _responses(problem, errors, freqs_hz)
     uncertain = uncertain_ball(problem, freqs_hz).bound(T, certain)
-    if problem.remainder_left is not None and problem.remainder_right is not None:
-        left = response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz)
-        uncertain = uncertain + spread(
-            left, (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz)
-        )
+    if problem.remainder is not None:
+        left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
+        uncertain = uncertain + spread(response @ left, right)
     return uncertain**2 + noise
 
 
@@ -57,14 +54,13 @@ def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Any
 def _responses(
     problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray
 ) -> tuple[AnyArray, AnyArray, AnyArray | float, AnyArray]:
-    """Return the response of an error system, T, ``T_s W_u``, and the density of noise."""
-    white, direct = problem.nominal.n_inputs + problem.nominal.n_states, problem.error_inputs
+    """Return the response of an error system to r, T, ``T_s W_u``, and the density of noise."""
+    m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response = errors.frequency_response(freqs_hz)
-    T = response[..., problem.uncertainty_input] @ problem.W_L.frequency_response(freqs_hz)
-    certain: AnyArray | float = 0.0
-    if errors.n_inputs > direct:
-        certain = response[..., direct:] @ problem.input_weight.frequency_response(freqs_hz)
-    return response, T, certain, np.sum(np.abs(response[..., white:direct]) ** 2, axis=(-2, -1))
+    d, r, noise, s = np.split(response, [m, m + n, m + 2 * n + len(problem.C)], axis=-1)
+    T = (d if problem.location.at_input else r) @ problem.W_L.frequency_response(freqs_hz)
+    certain = s @ problem.input_weight.frequency_response(freqs_hz) if s.size else 0.0
+    return r, T, certain, np.sum(np.abs(noise) ** 2, axis=(-2, -1))
 
 
 def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, float]:
@@ -131,20 +127,17 @@ def circle_mean(
 ) -> tuple[float, float]:
     """Return mean and error over the circle of an even density of angles (k,); `centers` are log poles."""
     edges = _edges(centers)
-    left, right = edges[:-1], edges[1:]
-    values, errors = _panels(density, left, right)
-    while errors.sum() > rtol * values.sum():
-        if len(values) > max_panels:
-            error = f"relative error {errors.sum() / values.sum():.2g} after {len(values)} panels, above {rtol:.2g}"
-            raise SynthesisError(f"Integrating the density: {error}; poles are extremely close to the unit circle.")
-        split = errors > min(0.5 * errors.max(), rtol * values.sum() / len(values))
-        middle = np.where(left[split] > 0, np.sqrt(left[split] * right[split]), right[split] / 4)
-        new_left = np.concatenate([left[split], middle])
-        new_right = np.concatenate([middle, right[split]])
-        new_values, new_errors = _panels(density, new_left, new_right)
-        left, right = np.concatenate([left[~split], new_left]), np.concatenate([right[~split], new_right])
-        values, errors = np.concatenate([values[~split], new_values]), np.concatenate([errors[~split], new_errors])
-    return float(values.sum() / np.pi), float(errors.sum() / np.pi)
+    panels = _panels(density, edges[:-1], edges[1:])
+    while (error := panels[3].sum()) > rtol * (total := panels[2].sum()):
+        if len(panels.T) > max_panels:
+            text = f"relative error {error / total:.2g} after {len(panels.T)} panels, above {rtol:.2g}"
+            raise SynthesisError(f"Integrating the density: {text}; poles are extremely close to the unit circle.")
+        split = panels[3] > min(0.5 * panels[3].max(), rtol * total / len(panels.T))
+        left, right, _, _ = panels[:, split]
+        middle = np.where(left > 0, np.sqrt(left * right), right / 4)
+        halves = _panels(density, np.concatenate([left, middle]), np.concatenate([middle, right]))
+        panels = np.hstack([panels[:, ~split], halves])
+    return float(panels[2].sum() / np.pi), float(error / np.pi)
 
 
 def _edges(centers: AnyArray) -> AnyArray:
@@ -160,8 +153,8 @@ def _edges(centers: AnyArray) -> AnyArray:
     return np.concatenate([[0.0], edges[apart]])
 
 
-def _panels(density: Callable[[AnyArray], AnyArray], left: AnyArray, right: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Both rules on every panel; logarithmic inside, linear in the panel that touches DC."""
+def _panels(density: Callable[[AnyArray], AnyArray], left: AnyArray, right: AnyArray) -> AnyArray:
+    """Return ends, integral and its error of every panel; logarithmic inside, linear in the one that touches DC."""
     linear = left <= 0
     log_left = np.log(np.where(linear, 1.0, left))
     log_right = np.where(linear, 0.0, np.log(right))
@@ -173,4 +166,4 @@ def _panels(density: Callable[[AnyArray], AnyArray], left: AnyArray, right: AnyA
         raise SynthesisError("Integrating the density: it is not finite; is the set well posed and the loop stable?")
     weighted = np.where(linear[:, None], values * right[:, None] / 2, values * angles * half[:, None])
     integral = weighted[:, : len(_NODES)] @ _WEIGHTS
-    return integral, np.abs(integral - weighted[:, len(_NODES) :] @ _ROUGH_WEIGHTS)
+    return np.stack([left, right, integral, np.abs(integral - weighted[:, len(_NODES) :] @ _ROUGH_WEIGHTS)])

@@ -14,7 +14,6 @@ import numpy as np
 
 from ...core.arrays import AnyArray
 from ...core.lti import StateSpace, block_diagonal, gain
-from ...core.rounding import ROUNDING
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import disturbed
 from .ball import uncertain_ball
@@ -28,13 +27,13 @@ def average_disturbance(problem: ObserverProblem, fit: Fit) -> tuple[StateSpace,
     """Return filters that shape white noise like the average over the set, at the input and at the state."""
     freqs = design_grid(problem)
     power = np.real(np.einsum("fii->fi", uncertain_ball(problem, freqs).average()))  # of w2
-    if is_diagonal(problem.W_L):
-        left = np.abs(problem.W_L.frequency_response(freqs)) ** 2
-        shaped = filters(np.sum(left, axis=-1) * power, freqs, problem.nominal.dt, fit)
+    left, dt = np.abs(problem.W_L.frequency_response(freqs)) ** 2, problem.nominal.dt
+    if left.shape[1] == left.shape[2] and not left[:, ~np.eye(left.shape[1], dtype=bool)].any():
+        shaped = filters(np.sum(left, axis=-1) * power, freqs, dt, fit)
     else:
-        shaped = problem.W_L @ filters(power, freqs, problem.nominal.dt, fit)
+        shaped = problem.W_L @ filters(power, freqs, dt, fit)
     rest = _remainder(problem, freqs)
-    return disturbed(problem, shaped, None if rest is None else filters(rest, freqs, problem.nominal.dt, fit))
+    return disturbed(problem, shaped, None if rest is None else filters(rest, freqs, dt, fit))
 
 
 def design_grid(problem: ObserverProblem, count: int = 400) -> AnyArray:
@@ -45,27 +44,11 @@ def design_grid(problem: ObserverProblem, count: int = 400) -> AnyArray:
     return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, count) / (2 * np.pi * dt)
 
 
-def is_diagonal(system: StateSpace) -> bool:
-    """Tell whether the system is square and its off-diagonal transfer functions vanish (Markov parameters)."""
-    if system.n_outputs != system.n_inputs:
-        return False
-    off = ~np.eye(system.n_outputs, dtype=bool)
-    block, size = system.B, float(np.abs(system.C).max(initial=0) * np.abs(system.B).max(initial=0))
-    if np.any(system.D[off]):
-        return False
-    for _ in range(2 * system.n_states):
-        if np.any(np.abs((system.C @ block)[off]) > ROUNDING * size):
-            return False
-        block = system.A @ block
-    return True
-
-
 def _remainder(problem: ObserverProblem, freqs_hz: AnyArray) -> AnyArray | None:
     """Average spectrum of the remainder, shape (f, n)."""
-    if problem.remainder_left is None or problem.remainder_right is None:
+    if problem.remainder is None:
         return None
-    left = problem.remainder_left.frequency_response(freqs_hz)
-    right = (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz)
+    left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
     energy = np.sum(np.abs(right) ** 2, axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
     return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 

@@ -31,8 +31,8 @@ def lower_bound(problem: ObserverProblem) -> float | None:
     W_L, W_R, dt = problem.W_L, problem.W_R, problem.nominal.dt
     members = [member(problem, sign * P) for P in shifts(W_L.n_inputs, W_R.n_outputs) for sign in (1.0, -1.0)]
     remainder = None
-    if problem.remainder_left is not None and problem.remainder_right is not None:
-        left, right = problem.remainder_left, problem.remainder_right @ problem.input_weight
+    if problem.remainder is not None:
+        left, right = problem.remainder
         remainder = mean([left @ gain(P, dt) @ right for P in shifts(left.n_inputs, right.n_outputs)])
     bounds = [least_error(problem, one, remainder) for one in (*members, mean(members))]
     return max((bound for bound in bounds if bound > 0), default=None)

@@ -22,12 +22,11 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from ...core.errors import SynthesisError
-from ...core.lti import StateSpace, gain
+from ...core.lti import StateSpace, block_diagonal
 from ...uncertainty.weights.magnitude import fit_magnitude
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import shaped_plant
@@ -93,8 +92,7 @@ def worst_case_h2(
     elapsed = time.perf_counter() - start
     if not bounded:
         return _design_alone(problem, controller)
-    nothing = gain(np.zeros((problem.correction_size, len(problem.C))), problem.nominal.dt)
-    candidates = [certified(problem, K, "worst_case_h2") for K in (nothing, controller)]
+    candidates = [certified(problem, K, "worst_case_h2") for K in (problem.nothing, controller)]
     best = min(candidates, key=lambda candidate: candidate.worst_case_h2 or 0.0)
     lower, gap, notes = enclosed(best.worst_case_h2 or 0.0, lower_bound(problem))
     note = "The spectral radius is that of the nominal loop and says nothing about robustness, worst_case_h2 does."
@@ -106,19 +104,17 @@ def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis
     if radius >= 1:
         loop = f"the loop has spectral radius {radius:.9g}"
         raise SynthesisError(f"Worst-case H2 synthesis: {loop}; add noise, or lower the order of the weights.")
-    facts: dict[str, Any] = {"injection": problem.injection, "spectral_radius": radius, "solver": "riccati"}
     notes = ("A design alone, without certificate.",)
-    return Synthesis("worst_case_h2", controller, Status.INACCURATE, **facts, notes=notes)
+    alone = Synthesis("worst_case_h2", controller, Status.INACCURATE, problem.injection, notes=notes)
+    return replace(alone, spectral_radius=radius, solver="riccati")
 
 
 def design(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpace:
     """Return the filter that is H2-optimal for shaped disturbances of input and state, in physical units."""
     plant = shaped_plant(problem, d, r)
     A, B, _, _ = problem.scaled
-    n, kd, kr = len(A), d.n_states, r.n_states
+    n, kd = len(A), d.n_states
     noises = plant.B1 @ plant.B1.T, plant.D21 @ plant.D21.T, plant.B1 @ plant.D21.T
     L, _ = predictor(plant.A, plant.C2, *noises, "Worst-case H2 synthesis")
-    L_xi, L_d, L_r = L[:n], L[n : n + kd], L[n + kd :]
-    dynamics = np.block([[d.A, np.zeros((kd, kr))], [np.zeros((kr, kd)), r.A]])
     output = np.hstack([B @ d.C, r.C @ r.A - A @ r.C])
-    return problem.to_physical(StateSpace(dynamics, np.vstack([L_d, L_r]), output, L_xi + r.C @ L_r, d.dt))
+    return problem.to_physical(StateSpace(block_diagonal([d, r]).A, L[n:], output, L[:n] + r.C @ L[n + kd :], d.dt))

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...core.arrays import AnyArray, Flags, frozen
 from ...core.linalg import entries_first, sigma_max_first, squared
-from ..forms import Form, residual
+from ..forms import Form, evenly, residual
 from ..settings import OUTLIER
 
 
@@ -93,7 +93,7 @@ def _nominals(G: AnyArray) -> AnyArray:
     middle = np.median(G.real, axis=0) + 1j * np.median(G.imag, axis=0)
     size = np.maximum(np.abs(middle), np.finfo(float).tiny)
     order = np.argsort((np.abs(G - middle) / size).mean(axis=(1, 2, 3)), kind="stable")
-    return np.sort(order[np.linspace(0, len(G) - 1, OUTLIER.nominals).round().astype(int)])
+    return np.sort(order[evenly(len(G), OUTLIER.nominals)])
 
 
 def _same(G: AnyArray, nominals: AnyArray) -> Flags:

@@ -30,7 +30,8 @@ import numpy as np
 from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.artifacts import Storable
 from ...core.errors import ConfigError, DataError
-from ..forms import Form, as_form, check_responses
+from ...core.frequency import check_grid
+from ..forms import Form, as_form, check_responses, evenly
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
 from .score import Comparison, OutlierScore, Status
@@ -189,7 +190,7 @@ def score_outliers(
     form, rate = as_form(form), float(false_alarm_rate)
     if not 0 < rate < 1:
         raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.01 is usual.")
-    rows = scored_rows(len(freqs))
+    rows = evenly(len(freqs), OUTLIER.frequencies)
     freqs, G = freqs[rows], G[:, rows]
     scales = balance(G)
     G = G / scales[0][:, None] * scales[1]
@@ -202,19 +203,14 @@ def score_outliers(
     return OutlierModel(form, names, freqs, G[inliers], *scales, scores, parts.threshold_db, rate)
 
 
-def scored_rows(count: int) -> AnyArray:
-    """Return the rows of frequencies that scores look at, where they are given more."""
-    return np.unique(np.linspace(0, count - 1, OUTLIER.frequencies).round().astype(int))
-
-
 def _population(
     responses: Any, unit_ids: tuple[str, ...] | None, freqs_hz: Any
 ) -> tuple[AnyArray, tuple[str, ...], AnyArray]:
     """Checked responses, names and frequencies."""
-    freqs = np.asarray(freqs_hz, float)
+    freqs = check_grid(freqs_hz, None)
     G = check_responses(responses, unit_ids, freqs)
     if len(G) < LEAST_SCORES:
         raise DataError(f"Outlier scores: need at least {LEAST_SCORES} units, found {len(G)}.")
-    if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
-        raise ConfigError(f"Outlier scores: need increasing positive frequencies, found {freqs[:3]}.")
+    if freqs[0] == 0:
+        raise ConfigError("Outlier scores: need frequencies above zero.")
     return G, tuple(unit_ids or map(str, range(len(G)))), freqs

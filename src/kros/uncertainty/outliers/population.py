@@ -22,8 +22,9 @@ from ...core.work import Work
 from ...identify import Factor, ModelSet, combine
 from ...identify.factors import lifted_factor
 from ...identify.identified import EpisodeFactors, IdentifiedModels
+from ..forms import evenly
 from ..settings import OUTLIER, QuantifySettings
-from .model import OutlierModel, score_outliers, scored_rows
+from .model import OutlierModel, score_outliers
 from .score import OutlierScore, Status
 from .tail import LEAST_SCORES
 
@@ -31,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 def score_population(
-    models: IdentifiedModels, settings: QuantifySettings, work: Work | None = None
+    models: IdentifiedModels, settings: QuantifySettings, work: Work
 ) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
     """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
@@ -41,7 +42,7 @@ def score_population(
         log.info("%s: outlier scores need at least three units", condition)
     tasks = [partial(score_condition, models.factors[c], identified, settings) for c, identified in scored.items()]
     rows, found = list[dict[str, Any]](), dict[str, OutlierModel]()
-    for condition, (outliers, samples) in zip(scored, (work or Work()).run("score outliers", tasks), strict=True):
+    for condition, (outliers, samples) in zip(scored, work.run("score outliers", tasks), strict=True):
         found[places[condition]] = outliers
         for score, n_samples in zip(outliers.scores, samples, strict=True):
             keys, used = (models.facts.keys(part, score.unit, condition) for part in ("test", "train"))
@@ -56,7 +57,7 @@ def score_condition(
 ) -> tuple[OutlierModel, list[int]]:
     """Score all units in one condition; with every unit's number of samples."""
     freqs = models.frequencies(settings.n_freqs)
-    freqs = freqs[scored_rows(len(freqs))]
+    freqs = freqs[evenly(len(freqs), OUTLIER.frequencies)]
     recorded = Recorded.of(factors, models, freqs)
     evidence = list(recorded.units.values())
     responses, ids = recorded.response(evidence), models.unit_ids

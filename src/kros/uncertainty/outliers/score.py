@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from ...core.arrays import AnyArray, Flags, frozen
-from ..forms import Form
+from ..forms import Form, evenly
 from ..settings import OUTLIER
 from .distances import Distances, scaled_levels
 from .tail import excesses
@@ -105,7 +105,7 @@ class Comparison:
     def _changes(self) -> AnyArray:
         """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
         G = self.responses[self.inliers]
-        G = G[np.unique(np.linspace(0, len(G) - 1, min(OUTLIER.changed, len(G))).round().astype(int))]
+        G = G[evenly(len(G), OUTLIER.changed)]
         levels = np.empty((*G.shape[2:], G.shape[1]))
         for i, j in np.ndindex(*G.shape[2:]):
             changed = G.copy()

@@ -25,6 +25,7 @@ from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.linalg import entries_first, multiply, sigma_max_first, squared
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, TINY
+from ..forms import evenly
 from ..settings import FIT, PROOF
 from .proof import Method
 
@@ -60,8 +61,8 @@ class Weight:
     right: StateSpace  # W_R, m' inputs and outputs
     left_orders: tuple[int, ...]  # of every diagonal entry
     right_orders: tuple[int, ...]
-    cover_max: float  # largest `sigma_max(W_L^-1 E_k W_R^-1)` over units and the dense grid, as used; at most one
-    overbound_db_max: float  # dB: largest excess of `Cover.cost_db` over the optimal cover
+    cover_max: float = np.nan  # largest `sigma_max(W_L^-1 E_k W_R^-1)` over units and the dense grid; at most one
+    overbound_db_max: float = np.nan  # dB: largest excess of `Cover.cost_db` over the optimal cover
     method: Method = Method.GRID  # how the bound between grid points is known, see `proof`
 
     def magnitudes(self, freqs_hz: ArrayLike) -> Cover:
@@ -87,7 +88,7 @@ def _descend(first: AnyArray, p: int) -> AnyArray:
     n = first.shape[0] + first.shape[1]
     if not alive.size:
         return np.zeros((n, len(size)))
-    chosen = alive[np.unique(np.linspace(0, len(alive) - 1, FIT.covered).round().astype(int))]
+    chosen = alive[evenly(len(alive), FIT.covered)]
     E = first[..., chosen] / size[chosen]
     leading = np.argsort(-sigma_max_first(E), axis=0)[: FIT.units]  # all others are covered by the scale
     E = E[:, :, np.unique(leading)]

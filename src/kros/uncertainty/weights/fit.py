@@ -13,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
+from ...core.arrays import AnyArray, Flags, frozen
 from ...core.frequency import bilinear_squared, nyquist_hz
 from ...core.lti import StateSpace, block_diagonal, gain
-from ..forms import Form, completion, residual
+from ..forms import Form, completion, evenly, residual
 from ..settings import FIT, PROOF, SET
 from .cover import Cover, Weight, optimal_cover
 from .joint import JointProblem, fit_jointly, refit
@@ -77,18 +77,22 @@ class _Fit:
         grid, realised = checking_grid(freqs_hz, dt), residuals.realised
         modes = np.zeros(0) if realised is None else realised.modes_hz(grid)
         self.checked_hz = joined(grid, modes)
-        self.freqs_hz = joined(freqs_hz, modes[(modes >= self.band[0]) & (modes <= self.band[1])])
+        self.freqs_hz = joined(freqs_hz, modes[self._inside(modes)])
         self.known = residuals.at(self.freqs_hz)
         self.optimal = optimal_cover(self.known)
+
+    def _inside(self, freqs_hz: AnyArray) -> Flags:
+        return (freqs_hz >= self.band[0]) & (freqs_hz <= self.band[1])
 
     def start(self, max_order: int, tolerance_db: float) -> Weight:
         """Fit at evenly chosen frequencies, and at fewer beyond the band."""
         dt, (p, m) = self.dt, self.known.shape[2:]
         if not self.known.any():
-            return Weight(gain(np.zeros((p, p)), dt), gain(np.eye(m), dt), (0,) * p, (0,) * m, np.nan, np.nan)
-        even = np.unique(np.linspace(0, len(self.freqs_hz) - 1, FIT.points).round().astype(int))
-        beyond = self.checked_hz[(self.checked_hz < self.band[0]) | (self.checked_hz > self.band[1])][::4]
-        self.problem, near = self._problem(np.sort(np.append(self.freqs_hz[even], beyond)))
+            return Weight(gain(np.zeros((p, p)), dt), gain(np.eye(m), dt), (0,) * p, (0,) * m)
+        even = self.freqs_hz[evenly(len(self.freqs_hz), FIT.points)]
+        self.problem, near = self._problem(
+            np.sort(np.append(even, self.checked_hz[~self._inside(self.checked_hz)][::4]))
+        )
         self.fitted = fit_jointly(self.problem, near, max_order, tolerance_db)
         return self._weight()
 
@@ -118,7 +122,7 @@ class _Fit:
     def _weight(self) -> Weight:
         sections, p = self.fitted.sections, self.known.shape[2]
         systems, orders = sections.systems(self.dt), tuple(sections.orders.tolist())
-        return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:], np.nan, np.nan)
+        return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:])
 
     def _problem(self, freqs_hz: AnyArray) -> tuple[JointProblem, Cover]:
         """Return the largest residuals by the optimal cover, with its cost within the band, and the cover."""
@@ -128,18 +132,15 @@ class _Fit:
         leading = np.argsort(-cover.ratio(E), axis=0)[: FIT.units]
         some = np.flatnonzero(np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0)
         cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
-        inside = (freqs_hz >= self.band[0]) & (freqs_hz <= self.band[1])
-        optimal = np.where(inside, np.interp(freqs_hz, self.freqs_hz[known], cost), np.inf)
+        optimal = np.where(self._inside(freqs_hz), np.interp(freqs_hz, self.freqs_hz[known], cost), np.inf)
         tau = bilinear_squared(freqs_hz, self.dt)
         return JointProblem.of(tau[some], optimal[some], E[leading[:, some], some]), cover.at(some)
 
 
 def _lifted(weight: Weight, proof: Certificate, on_grid: float) -> Weight:
     """Scale the left weight until it touches the residuals from above."""
-    lift, left = max(proof.bound, on_grid) * (1 + PROOF.rounding), weight.left
-    if not lift > 0:
-        return replace(weight, cover_max=0.0, method=proof.method)
-    left = StateSpace(left.A, left.B, left.C * lift, left.D * lift, left.dt)
+    lift, left = max(proof.bound, on_grid) * (1 + PROOF.rounding) or 1.0, weight.left
+    left = replace(left, C=left.C * lift, D=left.D * lift)
     return replace(weight, left=left, cover_max=on_grid / lift, method=proof.method)
 
 

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import chain, pairwise
 
@@ -156,7 +157,7 @@ def _touching(bound: Bound, freqs: AnyArray, values: AnyArray, dt: float) -> Fit
     (system,) = bound.sections.systems(dt)
     ratio = np.abs(system.frequency_response(freqs)[:, 0, 0]) / values
     touch = (1 + 4 * EPS) / ratio.min()
-    lifted = StateSpace(system.A, system.B, system.C * touch, system.D * touch, dt)
+    lifted = replace(system, C=system.C * touch, D=system.D * touch)
     return FittedMagnitude(lifted, float(20 * np.log10(ratio.max() / ratio.min())))
 
 

@@ -30,7 +30,7 @@ from ...core.arrays import AnyArray, frozen
 from ...core.frequency import nyquist_hz
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ..forms import OUTPUT_SIDE, Form, change_of, loop_of, residual_of
+from ..forms import Form, change_of, loop_of, residual_of
 from ..settings import PROOF
 
 Ratio = Callable[[AnyArray], AnyArray]
@@ -136,8 +136,7 @@ class Descriptor:
 
     def __matmul__(self, first: Descriptor) -> Descriptor:
         """Return the series connection, the other one first."""
-        A = _diagonal(first.A, self.A)
-        A[len(first.A) :, : len(first.A)] = self.B @ first.C
+        A = np.block([[first.A, np.zeros((len(first.A), len(self.A)))], [self.B @ first.C, self.A]])
         B, C = np.vstack([first.B, self.B @ first.D]), np.hstack([self.D @ first.C, self.C])
         return Descriptor(_diagonal(first.F, self.F), A, B, C, self.D @ first.D)
 
@@ -163,13 +162,16 @@ class Descriptor:
         n, (p, m) = len(self.A), self.D.shape
         if p < m:
             return self.transposed.pseudo_inverse().transposed
-        r = np.hstack([-self.C, np.zeros((p, n)), -self.D])  # of unknowns: states, adjoint states, x; P~ r = 0
-        A = np.block([[self.A, np.zeros((n, n)), self.B], [-self.C.T @ r], [self.D.T @ r]])
-        A[n : 2 * n, n : 2 * n] -= self.A.T
-        A[2 * n :, n : 2 * n] += self.B.T
-        B = np.vstack([np.zeros((n, p)), -self.C.T, self.D.T])
+        B = np.vstack([np.zeros((n, p)), -self.C.T, self.D.T])  # of unknowns: states, adjoint states, x
         C = np.hstack([np.zeros((m, 2 * n)), np.eye(m)])
-        return Descriptor(np.diag(np.repeat([1.0, 0.0], [2 * n, m])), A, B, C, np.zeros((m, p)))
+        F = np.diag(np.repeat([1.0, 0.0], [2 * n, m]))
+        return Descriptor(F, self._with_adjoint(1.0), B, C, np.zeros((m, p)))
+
+    def _with_adjoint(self, sign: float) -> AnyArray:
+        """Return the matrix of states, adjoint states and input of the system followed by its adjoint."""
+        C, D = self.C, self.D
+        below = [[sign * C.T @ C, -self.A.T, sign * C.T @ D], [-sign * D.T @ C, self.B.T, -sign * D.T @ D]]
+        return np.block([[self.A, np.zeros_like(self.A), self.B], *below])
 
     def crossings(self, gamma: float) -> AnyArray:
         r"""Return the s at which a singular value may equal gamma.
@@ -181,10 +183,8 @@ class Descriptor:
         [ D^T C       B^T              D^T D - gamma^2  ]
         """
         n, m = self.B.shape
-        C, D = self.C, self.D
-        below = [[-C.T @ C, -self.A.T, -C.T @ D], [D.T @ C, self.B.T, D.T @ D - gamma**2 * np.eye(m)]]
-        left = np.block([[self.A, np.zeros((n, n)), self.B], *below])
-        return _eigenvalues(left, _diagonal(self.F, self.F.T, np.zeros((m, m))))
+        level = np.diag(np.repeat([0.0, gamma**2], [2 * n, m]))
+        return _eigenvalues(self._with_adjoint(-1.0) - level, _diagonal(self.F, self.F.T, np.zeros((m, m))))
 
     def poles(self) -> AnyArray:
         """Return the finite eigenvalues of the pencil."""
@@ -254,7 +254,7 @@ def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
     """Tell whether a form rebuilds every regular unit of a shape exactly."""
     if form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
         return form is Form.ADDITIVE or n_outputs == n_inputs
-    return n_outputs >= n_inputs if form in OUTPUT_SIDE else n_outputs <= n_inputs
+    return n_outputs <= n_inputs if form.at_input else n_outputs >= n_inputs
 
 
 def _remainder(form: Form, G: Descriptor, Gp: Descriptor, E: Descriptor) -> Descriptor:
@@ -263,7 +263,7 @@ def _remainder(form: Form, G: Descriptor, Gp: Descriptor, E: Descriptor) -> Desc
         return (Gp - G) - change_of(form, G, E)
     loop = loop_of(form, G, E)
     inverse = (Descriptor.identity(len(loop.D)) - loop).inverse()
-    return Gp - (inverse @ G if form in OUTPUT_SIDE else G @ inverse)
+    return Gp - (G @ inverse if form.at_input else inverse @ G)
 
 
 def invert(system: StateSpace) -> StateSpace:

@@ -1,4 +1,4 @@
-"""`kros loop` on random controllers: none is called safe that diverges, and few are undecided.
+"""`examples/closed_loop` on random controllers: none is called safe that diverges, and few are undecided.
 
 python benchmarks/closed_loop.py RUN [--controllers 200]: draws controllers over the observers of a run, and simulates what is
 called safe: every unit's nonlinear model with the observer as it is deployed on other episodes than those of the verdict,
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import collections
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +19,16 @@ import numpy as np
 
 from kros.core import StateSpace, block_diagonal, hinf_norm
 from kros.data import EpisodeBatch
-from kros.evaluate.closed_loop import Controller, close_loop
-from kros.evaluate.closed_loop.linear_loop import LinearLoop
-from kros.evaluate.closed_loop.simulated_loop import diverging
 from kros.observer import Observer
 from kros.synthesis.problem.interconnect import interconnect
 from kros.uncertainty.quantify import UncertainModels
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "closed_loop"))
+
+from controller import Controller
+from linear_loop import LinearLoop
+from loop import close_loop
+from simulated_loop import diverging
 
 VERDICT, SAMPLES, MEMBERS = 1000, 5000, 20
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import control
 import numpy as np
@@ -11,13 +13,17 @@ import pytest
 
 import kros
 from kros.core import ConfigError, StateSpace, SynthesisError, block_diagonal, gain, hinf_norm
-from kros.evaluate.closed_loop import Controller, LoopStatus, close_loop
-from kros.evaluate.closed_loop.linear_loop import LinearLoop, linear_estimator
-from kros.evaluate.closed_loop.small_gain import Blocks, peak, worst_gain
 from kros.observer import Observer, Runtime
 from kros.synthesis import ObserverProblem
 from kros.synthesis.problem.interconnect import interconnect
 from kros.uncertainty import Form, rebuild
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "closed_loop"))
+
+from controller import Controller
+from linear_loop import LinearLoop, linear_estimator
+from loop import LoopStatus, close_loop
+from small_gain import Blocks, peak, worst_gain
 
 DT = 0.1
 LAG = StateSpace([[0.8]], [[0.5]], [[1.0]], [[0.0]], DT)

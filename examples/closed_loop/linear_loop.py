@@ -13,19 +13,19 @@ u = r + K x_hat <----+
 from __future__ import annotations
 
 import numpy as np
+from small_gain import Blocks
 
-from ...core.arrays import frozen
-from ...core.errors import DimensionError, SynthesisError
-from ...core.lti import StateSpace, gain
-from ...identify import ModelSet
-from ...lifting import Lifting
-from ...observer.data import ObserverData
-from ...observer.estimator.certificate import linear_part
-from ...observer.sensor import delay_of
-from ...synthesis import ObserverProblem
-from ...synthesis.problem.interconnect import interconnect
-from ...uncertainty import UncertainModel
-from .small_gain import Blocks
+from kros.core.arrays import frozen
+from kros.core.errors import DimensionError, SynthesisError
+from kros.core.lti import StateSpace, gain
+from kros.identify import ModelSet
+from kros.lifting import Lifting
+from kros.observer.data import ObserverData
+from kros.observer.estimator.certificate import linear_part
+from kros.observer.sensor import delay_of
+from kros.synthesis import ObserverProblem
+from kros.synthesis.problem.interconnect import interconnect
+from kros.uncertainty import UncertainModel
 
 
 @frozen

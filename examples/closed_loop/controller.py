@@ -8,14 +8,14 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field
 
-from ...core.errors import ConfigError
-from ...core.files import did_you_mean
-from ...core.lti import StateSpace, gain, real_array
-from ...core.rounding import AGREED
-from ...core.settings import Settings
-from ...identify import ModelSet
-from ...observer.data import ObserverData
-from ...observer.units import recorded_factors
+from kros.core.errors import ConfigError
+from kros.core.files import did_you_mean
+from kros.core.lti import StateSpace, gain, real_array
+from kros.core.rounding import AGREED
+from kros.core.settings import Settings
+from kros.identify import ModelSet
+from kros.observer.data import ObserverData
+from kros.observer.units import recorded_factors
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -26,12 +26,6 @@ class Controller(Settings):
     Its output is added to the command, ``u = r + K x_hat``: one that opposes has the minus sign in it. Matrices are
     rows of numbers; `limits` are those of the plant's inputs, where actuators have some.
 
-    Examples
-    --------
-    >>> from kros.evaluate.closed_loop import Controller
-    >>> names = {"inputs": ["velocity"], "outputs": ["voltage"], "sample_period_s": 0.001}
-    >>> Controller(D=[[-2.0]], **names).system.n_states
-    0
     """
 
     A: Rows = ()

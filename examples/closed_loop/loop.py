@@ -12,15 +12,16 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from ...core.errors import SynthesisError
-from ...core.norms import hinf_norm
-from ...data import EpisodeBatch
-from ...observer import Observer
-from ...uncertainty.quantify import UncertainModels
-from .controller import Controller
-from .linear_loop import LinearLoop
-from .simulated_loop import DEFAULT, diverging
-from .small_gain import peak, worst_gain
+from controller import Controller
+from linear_loop import LinearLoop
+from simulated_loop import DEFAULT, diverging
+from small_gain import peak, worst_gain
+
+from kros.core.errors import SynthesisError
+from kros.core.norms import hinf_norm
+from kros.data import EpisodeBatch
+from kros.observer import Observer
+from kros.uncertainty.quantify import UncertainModels
 
 ASSUMPTIONS = (
     "for margin, gain and spectral radius the loop is linear: functions are those of the plant, nothing saturates",
@@ -39,11 +40,6 @@ class LoopStatus(StrEnum):
     UNDECIDED
         There is no linear analysis, or its bounds are on both sides of the set.
 
-    Examples
-    --------
-    >>> from kros.evaluate.closed_loop import LoopStatus
-    >>> LoopStatus("SAFE") is LoopStatus.SAFE
-    True
     """
 
     SAFE = "SAFE"
@@ -53,14 +49,7 @@ class LoopStatus(StrEnum):
 
 @dataclass(frozen=True)
 class LoopResult:
-    """What is known about a loop; None is not known.
-
-    Examples
-    --------
-    >>> from kros.evaluate.closed_loop import LoopResult, LoopStatus
-    >>> LoopResult(LoopStatus.UNDECIDED, ("there is no linear analysis",)).lines()[0]
-    'UNDECIDED: there is no linear analysis'
-    """
+    """What is known about a loop; None is not known."""
 
     status: LoopStatus
     reasons: tuple[str, ...] = ()  # of a verdict that is not SAFE
@@ -117,16 +106,6 @@ def close_loop(observer: Observer, uncertain: UncertainModels, controller: Any, 
         Unknown names of signals, another sampling period, matrices that do not fit, or an observer of other lifted
         states than the models'.
 
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.evaluate.closed_loop import Controller, close_loop
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50)
-    >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
-    >>> damper = Controller(D=[[-0.01]], inputs=["velocity"], outputs=motors.inputs, sample_period_s=0.002)
-    >>> close_loop(observer, uncertain, damper, samples=500).status.value
-    'SAFE'
     """
     controller = controller if isinstance(controller, Controller) else Controller.from_system(controller)
     kind = observer.name.partition("/")[0]

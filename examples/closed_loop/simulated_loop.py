@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from controller import Controller
 
-from ...data import EpisodeBatch
-from ...identify import ModelSet
-from ...observer.data import ObserverData
-from ...observer.screen import screened
-from ...observer.simulate import Course
-from .controller import Controller
+from kros.data import EpisodeBatch
+from kros.identify import ModelSet
+from kros.observer.data import ObserverData
+from kros.observer.screen import screened
+from kros.observer.simulate import Course
 
 
 @dataclass(frozen=True)

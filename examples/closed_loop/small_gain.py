@@ -22,12 +22,12 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core.arrays import AnyArray as Array
-from ...core.arrays import ArrayLike, frozen
-from ...core.errors import SynthesisError
-from ...core.lti import StateSpace
-from ...core.norms import balanced, crossings, first_frequencies, to_continuous
-from ...core.rounding import ITERATED, TINY
+from kros.core.arrays import AnyArray as Array
+from kros.core.arrays import ArrayLike, frozen
+from kros.core.errors import SynthesisError
+from kros.core.lti import StateSpace
+from kros.core.norms import balanced, crossings, first_frequencies, to_continuous
+from kros.core.rounding import ITERATED, TINY
 
 _STEPS = 60  # of iterations that end much earlier
 

@@ -17,7 +17,7 @@ def test_filters_touch_their_spectra_from_above() -> None:
     freqs = np.geomspace(1e-3, 0.5 / DT, 400)
     corner = freqs[:, None] / np.array([20.0, 3.0])
     phi = np.array([4.0, 1e-6]) / (1 + corner**2) + np.array([0.01, 2e-9])
-    response = filters(phi, freqs, DT, FIT).frequency_response(freqs)
+    response = filters(phi, freqs, DT, 3, 0.5).frequency_response(freqs)
     ratio = np.abs(np.diagonal(response, axis1=1, axis2=2)) ** 2 / phi
     np.testing.assert_allclose(ratio.min(axis=0), 1.0, rtol=1e-9)
     overbounds = [FIT(freqs, np.sqrt(column), DT).overbound_db for column in phi.T]

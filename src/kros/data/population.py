@@ -208,10 +208,9 @@ class Population(Shown):
         return f"Population({sizes} every {self.sample_period_s:g} s; {channels})"
 
     def _summary_rows(self) -> dict[str, Any]:
-        first = f", the first with {len(self.read(self.episodes[0]))} samples" if self.episodes else ""
         rows = {f"{role.value}s": ", ".join(c.label for c in self.columns if c.role is role) for role in Role}
-        rows |= {"conditions": ", ".join(self.conditions), "episodes": f"{len(self.episodes)}{first}"}
-        return {"units": len(self.unit_ids), "period": f"{self.sample_period_s:g} s", **rows}
+        counts = {"units": len(self.unit_ids), "episodes": len(self.episodes)}
+        return {**counts, "conditions": ", ".join(self.conditions), "period": f"{self.sample_period_s:g} s", **rows}
 
     @property
     def columns(self) -> tuple[Channel, ...]:

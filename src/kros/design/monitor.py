@@ -20,10 +20,11 @@ from ..core.arrays import Array, Flags, frozen
 from ..core.rounding import EPS, ITERATED, ROUNDING
 from ..core.work import Work
 from ..observer import Observer
+from ..observer.estimator.regression import spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
 from ..observer.simulate import run_innovations
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
-from .validation import TrainingSet, spread
+from .validation import TrainingSet
 
 log = logging.getLogger(__name__)
 Group = tuple[str, str]  # unit and condition

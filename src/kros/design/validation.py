@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import field, replace
 from itertools import chain, zip_longest
-from typing import TypeVar
 
 import numpy as np
 
@@ -20,9 +19,8 @@ from ..evaluate.sensor import as_shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..observer import Observer, Seen
+from ..observer.estimator.regression import spread
 from ..observer.sensor import Sensors, in_units
-
-T = TypeVar("T")
 
 
 @frozen
@@ -115,11 +113,6 @@ def seen_by(identified: IdentifiedModels, measured: Sequence[int]) -> Seen:
     """Return the sizes of the measured states and of the inputs; far larger samples are implausible."""
     states, inputs, sizes = identified.population.states, identified.population.inputs, identified.sizes
     return Seen(np.array([sizes[states[i]] for i in measured]), np.array([sizes[name] for name in inputs]))
-
-
-def spread(keys: Sequence[T], count: int) -> list[T]:
-    """Return `count` keys, evenly spaced from the first to the last."""
-    return [keys[i] for i in np.linspace(0, len(keys) - 1, min(count, len(keys))).round().astype(int)]
 
 
 def hidden_mean(values: Array, measured: Sequence[int]) -> Array:

@@ -120,7 +120,11 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         IdentificationError
             With ``alpha = 0``, a function or input that depends on the others or does not vary; the message names it.
         """
-        self._check_parameters()
+        far = self.horizon is None or self.horizon >= 1
+        if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf or not far:
+            needs = "functions should be a list of texts, alpha at least zero and horizon at least one or None"
+            actual = f"found {self.functions!r}, {self.alpha!r}, {self.horizon!r}"
+            raise ConfigError(f"KoopmanRegressor: {needs}, {actual}.")
         values, edges = self._read(X, reset=True)
         checked = {"dtype": np.float64, "ensure_2d": False, "input_name": "y", "estimator": self}
         target = None if y is None else check_array(y, **checked)
@@ -148,13 +152,6 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         matrices = edmd(R, self.lifting_.n_lifted, self.alpha)
         self.A_, self.B_, self.n_pairs_ = matrices.A, matrices.B, len(rows)
         return self
-
-    def _check_parameters(self) -> None:
-        far = self.horizon is None or self.horizon >= 1
-        if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf or not far:
-            needs = "functions should be a list of texts, alpha at least zero and horizon at least one or None"
-            actual = f"found {self.functions!r}, {self.alpha!r}, {self.horizon!r}"
-            raise ConfigError(f"KoopmanRegressor: {needs}, {actual}.")
 
     def predict(self, X: Any) -> Array:
         """Predict the next state of every row, shape (n_samples, n_states), or (n_samples,) after such a `y`.

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..core.arrays import Array, Flags
+from ..core.arrays import Array
 from ..core.errors import DataError, DimensionError
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
@@ -59,7 +59,9 @@ def load_observer(
             f"Load observer: states {batch.states.shape} and load {load.shape} should agree in (n_samples, batch), "
             f"and no state be named {LOAD!r}, found {', '.join(lifting.states)}."
         )
-    at_limit = _at_limit(batch, settings)
+    at_limit = np.zeros(len(batch.keys), bool)  # where the controller does not do what its errors say
+    if settings.current is not None:
+        at_limit = np.abs(batch.states[..., settings.current]).max(axis=0) >= settings.limit
     used = np.flatnonzero(~at_limit)
     visible = _visible(batch.take(used.tolist()), load[:, used], int(at_limit.sum()), settings)
     place = {key: i for i, key in enumerate(visible.keys)}
@@ -74,13 +76,6 @@ def load_observer(
         name, with_load, tuple(measured), inputs, recordings, batch.sample_period_s, None, estimator
     )
     return result.observer, tuple(np.flatnonzero(at_limit).tolist())
-
-
-def _at_limit(batch: EpisodeBatch, settings: LoadSettings) -> Flags:
-    """Episodes in which the current reaches its limit, where the controller does not do what its errors say."""
-    if settings.current is None:
-        return np.zeros(len(batch.keys), bool)
-    return np.abs(batch.states[..., settings.current]).max(axis=0) >= settings.limit
 
 
 def _visible(batch: EpisodeBatch, load: Array, left_out: int, settings: LoadSettings) -> EpisodeBatch:

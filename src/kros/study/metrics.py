@@ -25,7 +25,10 @@ Part = dict[str, Any]  # of metrics.json
 def collect_metrics(context: Context, until: Stage) -> Part:
     """Collect the metrics of all stages up to one."""
     done = list(Stage)[: list(Stage).index(until) + 1]
-    metrics: Part = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done)}
+    manifest = context.store.manifest
+    timing = {str(stage): manifest[stage].seconds for stage in done if stage in manifest}
+    timing["total"] = sum(timing.values())
+    metrics: Part = {"schema": 1, "study": _study(context, done), "timing_s": timing}
     metrics["units"] = _units(context, done)
     for stage in done:
         if stage is Stage.EVALUATE:
@@ -62,12 +65,6 @@ def _study(context: Context, done: list[Stage]) -> Part:
     if Stage.IDENTIFY in done:
         study["alpha"] = context.identified.models(context.identified.edmd_kinds[0]).alpha
     return study | ({"deployed": context.observers_record["deployed"]} if Stage.SYNTHESIZE in done else {})
-
-
-def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
-    manifest = context.store.manifest
-    timing = {str(stage): manifest[stage].seconds for stage in done if stage in manifest}
-    return timing | {"total": sum(timing.values())}
 
 
 def _units(context: Context, done: list[Stage]) -> list[Part]:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ... import synthesis, uncertainty  # solvers load when they are used
+from ... import synthesis  # solvers load when they are used
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...identify.model_set import EDMD
@@ -106,8 +106,7 @@ class WorstCaseH2(Method):
     def design(self, task: DesignTask) -> Design:
         """Choose disturbances, then the order, on training episodes."""
         problem = task.require_problem()
-        fit = cached(uncertainty.fit_magnitude)
-        solve = partial(synthesis.worst_case_h2, tolerance_db=self.tolerance_db, fit=fit)
+        solve = partial(synthesis.worst_case_h2, tolerance_db=self.tolerance_db)
         tried = [Disturbances(corner, *noise) for corner, noise in product(self.corners, self.noises)]
         rough = [partial(solve, d.of(problem), bounded=False, max_order=self.orders[0]) for d in tried]
         disturbances = tried[best_design(task, rough)[0]]
@@ -128,16 +127,3 @@ def best_design(task: DesignTask, designs: Sequence[Callable[[], Synthesis]]) ->
         raise SynthesisError(reason)
     best = list(solved)[task.best([task.observer(one) for one in solved.values()])[0]]
     return best, solved[best]
-
-
-def cached(fit: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a fit that remembers its results: candidates that differ in noise alone share their shaping filters."""
-    known: dict[Any, Any] = {}
-
-    def fitted(freqs_hz: Any, magnitude: Any, dt: float, **options: Any) -> Any:
-        key = (freqs_hz.tobytes(), magnitude.tobytes(), dt, *sorted(options.items()))
-        if key not in known:
-            known[key] = fit(freqs_hz, magnitude, dt, **options)
-        return known[key]
-
-    return fitted

@@ -81,16 +81,12 @@ def linear_estimate(
 
     What channels without a signal contribute is `outside`, as `outside_percent` found it.
     """
-    try:
-        system, mean, unknown = linear_part(observer, modelled)
-    except SynthesisError as error:
-        raise SynthesisError(f"not certified for the set of plants: {error}") from error
+    system, mean, unknown = linear_part(observer, modelled)
     if unknown:
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         shares = ", ".join(f"{name} {percent:.3g} %" for name, percent in (outside or {}).items() if percent)
         share = f"; the missing ones contribute, in percent of the range: {shares}" if shares else ""
-        reason = f"the models have no signal {without_limits(unknown[0])}{more}{share}."
-        raise SynthesisError(f"not certified for the set of plants: {reason}")
+        raise SynthesisError(f"the models have no signal {without_limits(unknown[0])}{more}{share}.")
     return system, mean
 
 

@@ -81,16 +81,15 @@ class Recordings:
     @classmethod
     def of(cls, keys: Sequence[EpisodeKey], read: Read, bias: Array | None = None) -> Recordings:
         """Return the episodes with their lengths and the sizes of their states."""
-        lengths, lows, highs, n = list[int](), list[Array](), list[Array](), 0
+        extents, n = [], 0
         for batch in map(read, keys):
             values, n = np.concatenate([batch.states, batch.inputs], axis=-1)[:, 0], batch.states.shape[-1]
-            lengths.append(len(values))
-            lows.append(values.min(axis=0))
-            highs.append(values.max(axis=0))
+            extents.append((len(values), values.min(axis=0), values.max(axis=0)))
+        lengths, lows, highs = zip(*extents, strict=True)
         low, high = np.min(lows, axis=0), np.max(highs, axis=0)
         size = np.maximum(np.abs(low), np.abs(high))[:n]
         size[size == 0] = 1.0
-        return cls(tuple(keys), tuple(lengths), read, size, (low, high), bias)
+        return cls(tuple(keys), lengths, read, size, (low, high), bias)
 
     @property
     def length(self) -> float:
@@ -255,15 +254,13 @@ class Moments:
                 columns = np.hstack([rows @ whitening.directions, targets, np.ones((len(rows), 1))])
                 columns *= np.sqrt(weights)[:, None]
                 total[groups[key]] = total.get(groups[key], 0.0) + columns.T @ columns
-        return [cls._of_sums(whitening, total) for whitening, total in zip(whitenings, sums, strict=True)]
-
-    @classmethod
-    def _of_sums(cls, whitening: Whitening, sums: Mapping[Group, Array]) -> Moments:
-        """Return the moments of sums of squares and products of whitened rows, targets and ones."""
-        r, total = whitening.directions.shape[1], np.stack([*sums.values()])
-        total /= total[:, -1:, -1:]
-        power = np.diagonal(total, axis1=1, axis2=2)[:, r:-1]
-        return cls(whitening, tuple(sums), total[:, :r, :r], total[:, :r, r:-1], power)
+        moments = []
+        for whitening, total in zip(whitenings, sums, strict=True):
+            r, mean = whitening.directions.shape[1], np.stack([*total.values()])
+            mean /= mean[:, -1:, -1:]
+            power = np.diagonal(mean, axis1=1, axis2=2)[:, r:-1]
+            moments.append(cls(whitening, tuple(total), mean[:, :r, :r], mean[:, :r, r:-1], power))
+        return moments
 
     def of_groups(self, what: str) -> AnyArray:
         """Return fold, condition or part of every group."""
@@ -375,9 +372,9 @@ class Readout:
         return np.array(found)
 
 
-def spread(items: Sequence[T], count: int) -> set[T]:
+def spread(items: Sequence[T], count: int) -> list[T]:
     """Return so many items, evenly spaced from the first to the last."""
-    return {items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)}
+    return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
 
 
 def is_less(one: Array, other: Array, margin: float) -> bool:

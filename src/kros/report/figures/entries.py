@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ...core.arrays import AnyArray
 from ...identify import ModelSet
 from ...uncertainty import Form
 from ...uncertainty.unit_residuals import UnitResiduals
-from ..canvas import Axes, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
+from ..canvas import Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
 from ..names import model_label, shorten, words
 from ..theme import DRAWING, Tone
 
@@ -71,7 +70,9 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
                 freqs, bound[:, i, j], color=Tone.BLUE.light, lw=DRAWING.broad, alpha=DRAWING.shade, label="largest"
             )
             panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, label="fitted weight")
-            _mark_unit(panel, residuals, levels[..., i, j], alarm)
+            if alarm in residuals.unit_ids:
+                line = levels[residuals.unit_ids.index(str(alarm)), ..., i, j]
+                panel.plot(freqs, line, color=Tone.ALARM.light, label=f"unit {alarm}")
             frequency_axis(panel, freqs, "")
             order = f"order {residuals.entry_orders[i, j]}"
             note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT.light)
@@ -79,10 +80,3 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
     for j, panel in enumerate(block[0]):
         panel.set_title(f"{label},\nfrom {short(names[1][j])}")
     label_below(block[-1])
-
-
-def _mark_unit(axes: Axes, residuals: UnitResiduals, levels: AnyArray, alarm: str | None) -> None:
-    """Draw the unit that stands out in red."""
-    if alarm in residuals.unit_ids:
-        line = levels[residuals.unit_ids.index(str(alarm))]
-        axes.plot(residuals.freqs_hz, line, color=Tone.ALARM.light, label=f"unit {alarm}")

@@ -59,12 +59,14 @@ def _interface(facts: Facts, entry: Mapping[str, Any]) -> list[tuple[str, Sequen
 
     hidden = [axis_label(n, facts.unit(n)) for n in entry["estimates"] if n not in entry["measured"]]
     delay = f"a measurement delay of {late} samples is assumed" if late else "no measurement delay is assumed"
+    sensors = entry["sensor"].items()
+    assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in sensor.items() if v) for n, sensor in sensors}
     return [
         ("Reads", [f"Measured: {named(entry['measured'])}. Inputs: {named(entry['inputs'])}."]),
         ("Estimates", [f"{joined(hidden)}, for the next sample; {delay}."]),
         ("Rate", [f"One step every {dt:g} s ({1 / dt:g} Hz), {entry['states']} states."]),
         ("Parameters", _parameters(entry["parameters"], facts.get("calibration") is not None)),
-        ("Sensor", _sensor(facts, entry["sensor"])),
+        ("Sensor", [f"Assumed for {axis_label(n, facts.unit(n))}: {text}." for n, text in assumed.items() if text]),
     ]
 
 
@@ -76,12 +78,6 @@ def _parameters(parameters: Mapping[str, float | None], calibrated: bool) -> lis
     first = next(iter(parameters))
     how = f", from recordings at constant speed in both directions, or --track {first}" if calibrated else ""
     return [f"{values}; every unit has its own value: --parameter UNIT.{first}=VALUE{how}."]
-
-
-def _sensor(facts: Facts, sensor: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Say what the observer assumes of its sensors."""
-    assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in entry.items() if v) for n, entry in sensor.items()}
-    return [f"Assumed for {axis_label(name, facts.unit(name))}: {text}." for name, text in assumed.items() if text]
 
 
 def _next_unit(entry: Mapping[str, Any] | None) -> list[str]:

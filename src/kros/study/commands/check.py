@@ -104,7 +104,8 @@ def score_condition(
     if models.lifting.parameters:
         parameters = unit_parameters(population.select(units), load_calibration(store), identify_on(store))
     tasks = [(population.select([u], [condition]), everything[u], models.lifting) for u in units]
-    recorded, rows = Recorded.of(factors_of(store, condition), models, outliers.freqs_hz), Rows()
+    factors = EpisodeFactors.load(store.path("factors", quote(condition, safe="")))
+    recorded, rows = Recorded.of(factors, models, outliers.freqs_hz), Rows()
     halves = recorded.halves()
     motion = None if halves is None else outliers.motion_levels(*halves)
     for unit, factor in zip(units, executor.map(reduce_episodes, tasks), strict=True):
@@ -123,11 +124,6 @@ def score_condition(
         row = score_row(score, condition, len(keys), float(factor.n_samples.sum()) * models.sample_period_s)
         rows.append(row | {"units": outliers.n_units, "left_out": sorted(known)})
     return rows
-
-
-def factors_of(store: Store, condition: str) -> EpisodeFactors:
-    """Return the factors of a run's training episodes."""
-    return EpisodeFactors.load(store.path("factors", quote(condition, safe="")))
 
 
 def monitored(recordings: FieldRecordings) -> Rows:

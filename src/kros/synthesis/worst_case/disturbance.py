@@ -7,33 +7,31 @@ component of w2.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 
 from ...core.arrays import AnyArray
 from ...core.lti import StateSpace, block_diagonal, gain
+from ...uncertainty import fit_magnitude
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import disturbed
 from .ball import uncertain_ball
 
-Fit = Callable[..., Any]
-
 _FLOOR, _NOTHING = 1e-14, 1e-30  # relative power below which a channel is level; power of a channel that is absent
 
 
-def average_disturbance(problem: ObserverProblem, fit: Fit) -> tuple[StateSpace, StateSpace]:
+def average_disturbance(problem: ObserverProblem, max_order: int, tolerance_db: float) -> tuple[StateSpace, StateSpace]:
     """Return filters that shape white noise like the average over the set, at the input and at the state."""
     freqs = design_grid(problem)
     power = np.real(np.einsum("fii->fi", uncertain_ball(problem, freqs).average()))  # of w2
     left, dt = np.abs(problem.W_L.frequency_response(freqs)) ** 2, problem.nominal.dt
     if left.shape[1] == left.shape[2] and not left[:, ~np.eye(left.shape[1], dtype=bool)].any():
-        shaped = filters(np.sum(left, axis=-1) * power, freqs, dt, fit)
+        shaped = filters(np.sum(left, axis=-1) * power, freqs, dt, max_order, tolerance_db)
     else:
-        shaped = problem.W_L @ filters(power, freqs, dt, fit)
+        shaped = problem.W_L @ filters(power, freqs, dt, max_order, tolerance_db)
     rest = _remainder(problem, freqs)
-    return disturbed(problem, shaped, None if rest is None else filters(rest, freqs, dt, fit))
+    return disturbed(problem, shaped, None if rest is None else filters(rest, freqs, dt, max_order, tolerance_db))
 
 
 def design_grid(problem: ObserverProblem, count: int = 400) -> AnyArray:
@@ -53,7 +51,7 @@ def _remainder(problem: ObserverProblem, freqs_hz: AnyArray) -> AnyArray | None:
     return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
 
-def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, fit: Fit) -> StateSpace:
+def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, max_order: int, tolerance_db: float) -> StateSpace:
     """Return one filter a channel, whose magnitude touches the root of its power, shape (f, channels), from above."""
     systems = []
     for column in power.T:
@@ -61,7 +59,15 @@ def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, fit: Fit) -> StateSp
             systems.append(gain([[0.0]], dt))
             continue
         magnitude = np.sqrt(np.maximum(column, _FLOOR * column.max()))
-        system = fit(freqs_hz, magnitude / magnitude.max(), dt).system
+        shape = (magnitude / magnitude.max()).tobytes()
+        system = _fitted(freqs_hz.tobytes(), shape, dt, max_order, tolerance_db)
         ratio = magnitude / np.abs(system.frequency_response(freqs_hz)[:, 0, 0])
         systems.append(gain([[float(ratio.max())]], dt) @ system)
     return block_diagonal(systems)
+
+
+@lru_cache(maxsize=100)
+def _fitted(freqs_hz: bytes, magnitude: bytes, dt: float, max_order: int, tolerance_db: float) -> StateSpace:
+    """Return the system of a fit; problems that differ in noise alone share it."""
+    values = np.frombuffer(freqs_hz), np.frombuffer(magnitude)
+    return fit_magnitude(*values, dt, max_order=max_order, tolerance_db=tolerance_db).system

@@ -21,19 +21,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, block_diagonal
-from ...uncertainty.weights.magnitude import fit_magnitude
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import shaped_plant
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.kalman import predictor
 from .certificate import certified
-from .disturbance import Fit, average_disturbance
+from .disturbance import average_disturbance
 from .members import lower_bound
 
 
@@ -42,7 +40,6 @@ def worst_case_h2(
     *,
     max_order: int = 4,
     tolerance_db: float = 1.0,
-    fit: Fit = fit_magnitude,
     bounded: bool = True,
 ) -> Synthesis:
     """Return an observer filter with a certified H2 norm for every member of the uncertain set.
@@ -55,9 +52,6 @@ def worst_case_h2(
         Highest order of each shaping filter; the smallest within `tolerance_db` is taken.
     tolerance_db : float, dB
         Accuracy of the shaping filters. It costs optimality, never validity: the certificate uses the set itself.
-    fit : callable
-        ``fit(freqs_hz, magnitude, dt, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter;
-        by default `kros.uncertainty.fit_magnitude`.
     bounded : bool
         False: only the design, neither certified nor bounded from below, for those who design many and compare them on
         recordings.
@@ -86,7 +80,7 @@ def worst_case_h2(
     """
     problem = replace(problem, injection=Injection.STATE)
     problem.require_sound()
-    shaped = average_disturbance(problem, partial(fit, max_order=max_order, tolerance_db=tolerance_db))
+    shaped = average_disturbance(problem, max_order, tolerance_db)
     start = time.perf_counter()
     controller = design(problem, *shaped)
     elapsed = time.perf_counter() - start

@@ -30,11 +30,12 @@ import numpy as np
 
 import kros
 from kros.core.artifacts import write_json
+from kros.data import write_parquet
 from kros.evaluate import unit_interval
+from kros.plants import HarmonicDrivePopulation
 from kros.report.error_tables import ErrorCell, ErrorTable, tables_of
 from kros.report.names import BASELINES, minus, number, split_observer
 from kros.study import load_config
-from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.executors import Lines, available_cores
 
@@ -149,14 +150,11 @@ def _band_db(rows: Sequence[Mapping[str, Any]], published: Sequence[Mapping[str,
 def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace) -> dict[str, Any]:
     """Simulate and study a population; return what is known about units that were left out."""
     recordings = folder / "recordings"
-    if not (recordings / "truth.json").exists():  # written last
+    if not (recordings / "population.json").exists():  # written last
         shutil.rmtree(recordings, ignore_errors=True)
-        simulate_to(
-            recordings,
-            Simulation(
-                options.units, options.episodes, options.seconds, options.seed, spread=spread, outlier=False, loop=loop
-            ),
-        )
+        sizes = options.units, options.episodes, options.seconds, options.seed
+        drives = HarmonicDrivePopulation(*sizes, spread=spread, loop=loop).simulate().population
+        write_parquet(drives, recordings)
     both: dict[str, Any] = {"rows": [], "observers": {}}
     for name, settings in STUDIES.items():
         study = folder / f"{name}.toml"

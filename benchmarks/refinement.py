@@ -21,9 +21,10 @@ import numpy as np
 import kros
 from kros.core.norms import hinf_norm
 from kros.core.work import Work
+from kros.data import write_parquet
 from kros.identify import ModelSet, free_run
+from kros.plants import HarmonicDrivePopulation
 from kros.study import validate_config
-from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -51,9 +52,8 @@ def main() -> None:
 def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.Namespace) -> dict[str, Any]:
     """Simulate one population, identify and quantify it, return the facts."""
     recordings, out = folder / "recordings", folder / "run"
-    simulate_to(
-        recordings, Simulation(options.units, options.episodes, 20.0, seed, spread=spread, outlier=False, loop=loop)
-    )
+    drives = HarmonicDrivePopulation(options.units, options.episodes, 20.0, seed, spread=spread, loop=loop)
+    write_parquet(drives.simulate().population, recordings)
     raw = {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": True}}
     config = validate_config(raw, folder)
     metrics = kros.run(config, out, until=Stage.QUANTIFY, workers=options.workers).metrics
@@ -81,7 +81,6 @@ def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
             "peak_db": round(float(metrics["uncertainty"][name]["peak_db"]["inverse_input_multiplicative"]), 2),
             "fitted_db": round(20 * np.log10(hinf_norm(uncertain.weight.right @ uncertain.weight.left)), 2),
             "overbound_db": round(weight["overbound_db_max"], 2),
-            "structure": weight["structure"],
         }
     return found
 

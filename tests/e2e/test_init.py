@@ -203,3 +203,26 @@ def test_one_recording_a_unit_is_cut_into_episodes(kros, tmp_path):
     assert [len(keys) for _, _, keys in found.groups()] == [5] * 3
     whole = np.concatenate([found.read(k) for k in found.keys(found.unit_ids[0])])
     np.testing.assert_allclose(whole, pendulums.read(pendulums.episodes[0]), rtol=1e-8, atol=1e-9)
+
+
+def test_single_samples_without_a_value_cost_no_episode(kros, tmp_path, motors):
+    recordings = tmp_path / "recordings"
+    recordings.mkdir()
+    for i, key in enumerate(motors.episodes):
+        values = motors.read(key)
+        table = np.column_stack([motors.sample_period_s * np.arange(len(values)), values])
+        table[100 + i, 2] = np.nan
+        np.savetxt(
+            recordings / f"{key.unit}_{key.episode}.csv",
+            table,
+            "%.9g",
+            ",",
+            header="time,position,velocity,current,voltage",
+            comments="",
+        )
+    result = kros("init", recordings, "--out", tmp_path / "study.toml")
+    assert result.exit_code == 0, result.output
+    assert f"NaN in {len(motors.episodes)} episodes is bridged by straight lines" in result.output
+    found = open_source(load_config(tmp_path / "study.toml"))
+    whole = np.array([found.read(key) for key in found.episodes])
+    np.testing.assert_allclose(whole, [motors.read(k) for k in motors.episodes], atol=2e-2 * np.abs(whole).max())

@@ -38,7 +38,8 @@ def population(episodes: Any = None, units: tuple[Unit, ...] = ()) -> Population
 def test_non_finite(rows: slice, value: Any, found: str) -> None:
     bad = values()
     bad[rows, 1] = value
-    advice = r"fix the source or set data\.on_nan = \"drop_episode\""
+    bridge = r'bridge short gaps by \[\[data\.prepare\]\] step = "resample"'
+    advice = rf"fix the source, {bridge}, or set data\.on_nan = \"drop_episode\""
     match = rf"^Episode 7 of unit 001011 \(load\): channel 'v' has {found}; {advice}\.$"
     with pytest.raises(DataError, match=match):
         check_episode(bad, KEY, CHANNELS)

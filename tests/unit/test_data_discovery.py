@@ -128,6 +128,8 @@ def test_hostile_layouts_are_read_as_people_do_or_asked_about(paths, first, unit
         ("i/A", "i", "A"),
         ("Weg in mm", "Weg", "mm"),
         ("time_ms", "time", "ms"),
+        ("speed_deg/s", "speed", "deg/s"),
+        ("v_m/s", "v", "m/s"),
         ("pos_x", "pos_x", ""),
         ("v_A", "v_A", ""),
         ("tau_max", "tau_max", ""),

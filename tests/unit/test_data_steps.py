@@ -7,7 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, from_frame, prepare, steps
-from kros.data.prepare import parse_steps
+from kros.data.prepare import parse_steps, with_gaps
 from kros.data.steps import Resample, lowpass
 
 KEY = EpisodeKey("a", "default", "0")
@@ -115,6 +115,15 @@ def test_resample_declared_later_lifts_the_error_of_uneven_time() -> None:
     assert even.sample_period_s == 0.01
     grid = uneven(0.01, 400, 2)[0] + 0.01 * np.arange(len(even.read(KEY)))
     np.testing.assert_allclose(even.read(KEY)[:, 0], np.sin(grid), atol=1e-4)
+
+
+def test_resample_bridges_samples_that_hold_nan_but_not_those_that_may_be_missing() -> None:
+    time = 0.01 * np.arange(400)
+    values = np.column_stack([np.sin(time), np.cos(time), time])
+    values[[7, 100, 101], [0, 1, 2]] = np.nan
+    holes = prepare(from_arrays({KEY: values}, CHANNELS, 0.01), [steps.Resample(0.01)])
+    np.testing.assert_allclose(holes.read(KEY)[:, 0], np.sin(time), atol=1e-4)
+    assert np.isnan(with_gaps(holes).read(KEY)[7, 0])
 
 
 def test_resample_takes_the_longest_stretch_without_gaps_and_refuses_time_that_runs_backwards() -> None:

@@ -67,6 +67,8 @@ class PreparedSource:
     def _prepared(self, recording: Recording) -> tuple[Array, tuple[Channel, ...]]:
         """Return what steps make of an episode, or of a part of it, and the channels."""
         signals = Signals(self.channels, self.period_s)
+        if not self.gaps and any(step.makes_even for step in self.steps):
+            recording = recording.usable(self.period_s)
         for step in self.steps:
             recording = step.apply(recording, signals.channels, signals.period_s)
             signals = step.describe(signals)

@@ -56,6 +56,21 @@ class Recording:
         time = None if self.time_s is None else self.time_s[start:stop]
         return replace(self, values=self.values[start:stop], time_s=time)
 
+    def distinct(self) -> Recording:
+        """Return the same without samples that repeat the time and all values of those before, as late loggers write."""
+        if self.time_s is None:
+            return self
+        again = 1 + np.flatnonzero(np.diff(self.time_s) == 0)
+        drop = [k for k in again if np.array_equal(self.values[k], self.values[k - 1], equal_nan=True)]
+        return replace(self, values=np.delete(self.values, drop, axis=0), time_s=np.delete(self.time_s, drop))
+
+    def usable(self, period_s: float) -> Recording:
+        """Return the same without samples that hold NaN or infinity, with the time of the others."""
+        usable_rows = usable(self.values).all(axis=1)
+        even = np.arange(len(self.values), dtype=np.float64) * period_s
+        time = even if self.time_s is None else self.time_s
+        return replace(self, values=self.values[usable_rows], time_s=time[usable_rows])
+
     def ended(self) -> Recording:
         """Return the same without a last sample that repeats the stamp before it, as stopped recorders write."""
         time = self.time_s
@@ -78,7 +93,7 @@ class Recordings:
         if key not in self.places:
             others = f"this source has {len(self.places)} other episodes"
             raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
-        return self.read(key, self.places[key]).ended()
+        return self.read(key, self.places[key]).distinct().ended()
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
         """Yield one episode in blocks of about `rows` samples where the format can, else whole."""
@@ -222,7 +237,8 @@ def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], fi
         if bad.size:
             what = " and ".join(kind for kind, places in kinds.items() if places.any())
             where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
-            advice = 'fix the source or set data.on_nan = "drop_episode"'
+            bridge = 'bridge short gaps by [[data.prepare]] step = "resample"'
+            advice = f'fix the source, {bridge}, or set data.on_nan = "drop_episode"'
             raise NonFiniteError(f"{title(key)}: channel {channel.name!r} has {bad.size} {what} at {where}; {advice}.")
 
 

@@ -241,7 +241,8 @@ class Resample(Step):
 
     At the same or a higher rate this is linear interpolation. When the rate falls, samples are interpolated to a grid
     that is an integer number of times finer, filtered without delay below the new Nyquist frequency, and thinned. All
-    channels are treated alike, so linear relations between them survive.
+    channels are treated alike, so linear relations between them survive. Samples in which a channel holds NaN or
+    infinity count as not recorded.
 
     Parameters
     ----------

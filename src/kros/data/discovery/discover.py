@@ -229,11 +229,14 @@ def _examined(
     population, mapping, notes = draft.population, draft.mapping, dict(draft.notes)
     looks = examine(population, work)
     wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
-    nan, counts = [s.nan for s in good if s.nan], Counter((s.key.unit, s.key.condition) for s in good if not s.nan)
+    nan = [s for s in good if s.nan]
+    bridged = len(nan) if min((s.n_samples for s in nan), default=0) >= RULE.shortest_piece else 0
+    counts = Counter((s.key.unit, s.key.condition) for s in good if bridged or not s.nan)
     if not counts:
         why = f"{looks[0].key}: {looks[0].wrong or looks[0].nan}"
         raise DataError(f"Looking at {source}: none of {len(looks)} episodes can be used; {why}.")
-    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()] + nan
+    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]
+    findings += [] if bridged else [s.nan for s in nan]
     few = [group for group, n in counts.items() if n < 2]
     if 2 * len(few) > len(counts) and min(s.n_samples for s in good) >= RULE.pieces * RULE.shortest_piece:
         mapping = mapping | {"pieces": RULE.pieces}
@@ -244,21 +247,25 @@ def _examined(
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
     mapping = mapping | _exclusion([*excluded, *(_relative(population, source, key) for key in wrong)])
     retained = read_csv_folder(source, mapping)
-    prepare, text = _resampling(population, source, good)
+    prepare, text = _resampling(population, source, good, bridged)
     reading = _reading(retained, source)
-    return Discovery(mapping, prepare, draft.columns, retained, notes, (*findings, *text), bool(nan), reading)
+    return Discovery(
+        mapping, prepare, draft.columns, retained, notes, (*findings, *text), bool(nan) and not bridged, reading
+    )
 
 
 def _resampling(
-    population: Population, source: Path, looks: Sequence[EpisodeLook]
+    population: Population, source: Path, looks: Sequence[EpisodeLook], bridged: int
 ) -> tuple[tuple[Keys, ...], list[str]]:
-    """Return the step that brings uneven time to one period, and a sentence about it; nothing where time is even."""
+    """Return the step that makes time even or bridges NaN, and a sentence about it; nothing where neither is needed."""
     median, worst = float(np.median([s.period_s for s in looks])), max(looks, key=lambda s: s.uneven)
     period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
-    if not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks):
+    even = not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks)
+    if even and not bridged:
         return (), []
     recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
-    text = f"time is uneven: all episodes are resampled to a period of {period_s:g} s {recorded}"
+    text = f"NaN in {bridged} episodes is bridged by straight lines" if even else "time is uneven"
+    text += f": all episodes are resampled to a period of {period_s:g} s {recorded}"
     if uneven:
         where = f"at sample {worst.uneven[1]} of {_relative(population, source, worst.key)}"
         text += f", the worst step differs by {worst.uneven[0] * period_s:.3g} s {where}"

@@ -35,7 +35,7 @@ class EpisodeLook:
 
     key: EpisodeKey
     wrong: str = ""  # why it cannot be used, or nothing
-    n_samples: int = 0
+    n_samples: int = 0  # that can be used
     period_s: float = np.nan  # median step of time
     uneven: tuple[float, int] = (0.0, 0)  # largest relative deviation of a step of time, and the sample before it
     nan: str = ""  # where it holds NaN or infinity, or nothing
@@ -68,7 +68,7 @@ def _look(population: Population) -> list[EpisodeLook]:
             looks[key] = replace(look, digest=digest_of(values))
             watch.add(key, values)
         except NonFiniteError as error:
-            looks[key] = replace(look, nan=str(error))
+            looks[key] = replace(look, nan=str(error), n_samples=len(recording.usable(look.period_s).values))
         except DataError as error:
             looks[key] = EpisodeLook(key, str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())

@@ -272,11 +272,12 @@ class CsvRecordings(Recordings):
         if place.piece[1] > 1 or place.rows is not None:
             yield self(key)
             return
-        first, waiting = np.empty(0), list[Recording]()
+        first, last, waiting = np.empty(0), np.empty((0, len(place.wanted))), list[Recording]()
         for values in self._values(place, rows):
             yield from waiting
             first = first if first.size else values[:1]
-            waiting = [self._recording(key, values, first)]
+            joined, n, last = np.vstack([last, values]), len(last), values[-1:]
+            waiting = [self._recording(key, joined, first).distinct().cut(n, len(joined))]
         yield waiting[0].ended()
 
     def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from batches import run_with_status
+from batches import batch_of, run_with_status
 from recorded_plant import DT, FEW, LIFTING, plant
 
 import kros
@@ -14,7 +14,7 @@ from kros.core.errors import ConfigError
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
-from kros.observer import Observer, Recordings, identify_estimator, run_observer
+from kros.observer import EstimatorSettings, Observer, Recordings, identify_estimator, run_observer
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
@@ -64,8 +64,8 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     made = design(recordings)
     whitening = Whitening.of(made, samples([made])[0])
     (moments,) = Moments.of([made], [whitening])
-    penalty = 1e-6
-    (found,) = moments.solved(np.ones(len(moments.groups)), [penalty])
+    penalty, start = 1e-6, 0.1
+    (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, start)])
     parts: dict = {}
     for key, rows, targets, weights in made.rows(recordings, FEW.rows):
         parts.setdefault(made.groups[key], []).append((rows @ whitening.directions, targets, weights))
@@ -74,7 +74,8 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
         size = np.sqrt(sum(w.sum() for *_, w in own) * len(parts))
         X += [F * np.sqrt(w)[:, None] / size for F, _, w in own]
         T += [t * np.sqrt(w)[:, None] / size for _, t, w in own]
-    root = np.linalg.cholesky(whitening.trust + penalty * np.diag(whitening.penalty)).T
+    prior = whitening.trust + start**2 * whitening.start + penalty * np.diag(whitening.penalty)
+    root = np.linalg.cholesky(prior).T
     stacked = np.vstack([*X, root]), np.vstack([*T, np.zeros((len(root), 3))])
     np.testing.assert_allclose(found, np.linalg.lstsq(*stacked, rcond=None)[0], atol=1e-6 * np.abs(found).max())
 
@@ -137,8 +138,7 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     made = design(alone, settings=settings)
     whitening = Whitening.of(readout.design, readout.sample)
     (moments,) = Moments.of([made], [whitening])
-    penalty = float(readout.penalties[1])
-    (coefficients,) = moments.solved(np.ones(len(moments.groups)), [penalty])
+    (coefficients,) = moments.solved(np.ones(len(moments.groups)), [tuple(readout.penalties[1])])
     group = readout.design.groups[key]
     np.testing.assert_allclose(
         readout.others[group][:, 1],
@@ -302,3 +302,35 @@ def test_families_grow_and_a_measurement_that_never_arrives_is_refused():
         interpolated(np.full((10, 1), np.nan))
     line = np.arange(10.0)[:, None]
     np.testing.assert_allclose(interpolated(np.where(line % 3 == 1, np.nan, line)), line)
+
+
+def from_rest(places: list[float], seed: int) -> tuple[Recordings, dict]:
+    """A decaying oscillator that starts at rest at given places, where its measurement alone says what follows."""
+    A = np.linalg.matrix_power(np.array([[1.0, 0.01], [-0.04, 0.996]]), 1)
+    rng, batches = np.random.default_rng(seed), {}
+    for episode, place in enumerate(places):
+        for unit in ("a", "b", "c", "d"):
+            x, u = np.zeros((400, 2)), 0.3 * rng.standard_normal((400, 1))
+            x[0] = place, 0.0
+            for k in range(399):
+                x[k + 1] = A @ x[k] + [0.0, 0.05 * u[k, 0]]
+            measured = x + 1e-3 * rng.standard_normal(x.shape)
+            key = EpisodeKey(unit, "default", str(episode))
+            batches[key] = batch_of(measured[:, None], u[:, None], 0.01)
+    return Recordings.of(list(batches), batches.__getitem__), batches
+
+
+def test_values_of_the_first_sample_are_trusted_where_left_out_episodes_confirm_it():
+    lifting = Lifting(("position", "velocity"))
+    rng, settings = np.random.default_rng(3), {"dense": 8, "longest": 16, "rows": 20_000}
+    recordings, _ = from_rest(list(rng.uniform(-2, 2, 6)), 1)
+    unseen = from_rest(list(rng.uniform(-2, 2, 4)), 2)[1]
+    errors = []
+    for trust in ((1.0,), (1.0, 0.1, 0.01)):
+        chosen = EstimatorSettings(**settings, start_trust=trust)
+        observer = identify_estimator("e", lifting, (0,), ("u",), recordings, 0.01, settings=chosen).observer
+        off = [
+            run_observer(observer, b.states[..., :1], b.inputs)[:, 0, 1] - b.states[:, 0, 1] for b in unseen.values()
+        ]
+        errors.append(np.sqrt(np.mean(np.square(off))))
+    assert errors[1] < 0.8 * errors[0]

@@ -71,16 +71,16 @@ class Bank:
         return np.hstack([*parts, np.ones((len(at), 1))])
 
     def sizes(self, rms: Array) -> Array:
-        """Return the sizes of entries, their RMS; for the start that of its constant, since machines start at rest."""
-        size, first = rms.copy(), self._first
-        size[first] = np.repeat(rms[first][self.channels - 1 :: self.channels], self.channels)
+        """Return the sizes of entries, their RMS; for the start of its decay by the channel's: machines start at rest."""
+        size, first, moving = rms.copy(), self._first, self.channels - 1
+        size[first] = np.outer(rms[first][moving :: self.channels], [*rms[:moving], 1.0]).ravel()
         return np.maximum(size, ITERATED * size.max())
 
-    def trust(self, settings: EstimatorSettings) -> Array:
+    def trust(self, nonlinear: float, start: float) -> Array:
         """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
         channel = self.channel
-        trust = np.where(channel < self.linear, 0.0, settings.nonlinear_trust)
-        trust[self._first] = settings.start_trust
+        trust = np.where(channel < self.linear, 0.0, nonlinear)
+        trust[self._first] = start
         return np.where(channel < self.channels - 1, trust, 0.0)
 
     @property

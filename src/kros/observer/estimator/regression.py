@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import compress
+from itertools import compress, product
 from typing import TypeVar
 
 import numpy as np
@@ -215,7 +215,8 @@ class Whitening:
 
     directions: Array  # (p, r)
     penalty: Array  # (r,), 1 / sigma^2
-    trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
+    trust: Array  # (r, r), moments of the rows that say how far entries may be wrong, apart from the start
+    start: Array  # (r, r), the same of values of the first sample that may be wrong by their size
 
     @classmethod
     def of(cls, design: Design, sample: tuple[Array, Array]) -> Whitening:
@@ -223,15 +224,17 @@ class Whitening:
         X, weights = sample
         size = design.bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
-        trust, bias = np.diag(design.bank.trust(design.settings)), design.recordings.bias
+        bank, settings, bias = design.bank, design.settings, design.recordings.bias
+        trust, start = (np.diag(bank.trust(*of)) for of in ((settings.nonlinear_trust, 0.0), (0.0, 1.0)))
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
             moved = (samples([design], bias)[0][0] - X) * scale
             trust = np.vstack([trust, qr_triangle(moved)])
-        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust])))
+        least = min(settings.start_trust) * start
+        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, least])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
-        rows = trust @ (directions * size[:, None])
-        return cls(directions, sigma[:count] ** -2.0, rows.T @ rows)
+        moments = (rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, start)))
+        return cls(directions, sigma[:count] ** -2.0, *moments)
 
 
 @frozen
@@ -272,19 +275,37 @@ class Moments:
         found = self.power[groups] - 2 * np.einsum("in,gin->gn", coefficients, self.cross[groups]) + quadratic
         return np.maximum(found, 1e-30)
 
-    def solved(self, weights: Array, penalties: Sequence[float]) -> Iterator[Array]:
-        """Yield ridge coefficients (r, n) of groups with weights, for every penalty."""
+    def solved(self, weights: Array, candidates: Sequence[tuple[float, float]]) -> Iterator[Array]:
+        """Yield ridge coefficients (r, n) of groups with weights, for every penalty and relative error of the start."""
         from scipy.linalg import cho_factor, cho_solve
 
         weights = weights / weights.sum()
-        gram = np.tensordot(weights, self.gram, 1) + self.whitening.trust
+        whitening = self.whitening
+        gram = np.tensordot(weights, self.gram, 1) + whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 16 * len(gram) * EPS
-        for penalty in penalties:
-            A = gram + np.diag(penalty * self.whitening.penalty)
+        for penalty, error in candidates:
+            A = gram + error**2 * whitening.start + np.diag(penalty * whitening.penalty)
             q = 1 / np.sqrt(np.diag(A))
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
+
+    def best(self, errors: Array, starts: int, settings: EstimatorSettings) -> Whole:
+        """Return the best candidate of every state by logarithms of errors (groups, candidates, n) on what is left out.
+
+        Of relative errors of the start, a later one is taken if it gains enough over parts, by the margin: episodes
+        that start at other places have to confirm it.
+        """
+        gain = -2 * np.log1p(-settings.start_gain)
+        # A state at zero throughout a group would ask for no estimate of it at all.
+        counted = (self.power > 0)[:, None]
+        mean = errors.mean(axis=0, where=counted | ~counted.any(axis=0))
+        best = mean[::starts].argmin(axis=0) * starts
+        for i, state in np.ndindex(starts, len(best)):
+            other = mean[i::starts, state].argmin() * starts + i
+            one, before = (by("part", self.groups, errors[:, c, state]) for c in (other, best[state]))
+            best[state] = other if is_less(one + gain, before, settings.margin) else best[state]
+        return best
 
     def known(self, group: Group) -> Flags:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
@@ -292,11 +313,11 @@ class Moments:
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
         return next(known for known in (folds & parts, folds, parts, folds | True) if (known & alike).any())
 
-    def without(self, weights: Array, penalties: Sequence[float]) -> dict[Group, list[Array]]:
-        """Return the coefficients that do not know a group, for every group and penalty."""
+    def without(self, weights: Array, candidates: Sequence[tuple[float, float]]) -> dict[Group, list[Array]]:
+        """Return the coefficients that do not know a group, for every group and candidate."""
         known = {group: self.known(group) for group in self.groups}
         several = {rest.tobytes(): np.where(rest, weights, 0.0) for rest in known.values()}
-        found = {key: list(self.solved(rest, penalties)) for key, rest in several.items()}
+        found = {key: list(self.solved(rest, candidates)) for key, rest in several.items()}
         return {group: found[rest.tobytes()] for group, rest in known.items()}
 
 
@@ -309,7 +330,7 @@ class Readout:
     coefficients: Array  # (p, n)
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
-    penalties: Array  # (n,)
+    penalties: Array  # (n, 2), and relative errors of the start
     others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
 
     @classmethod
@@ -323,22 +344,21 @@ class Readout:
     def _fitted(cls, design: Design, sample: tuple[Array, Array], moments: Moments) -> Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = moments.whitening
-        weights, penalties = condition_weights(moments), design.settings.penalties
-        others = moments.without(weights, penalties)
+        weights, settings = condition_weights(moments), design.settings
+        candidates = [*product(settings.penalties, settings.start_trust if design.bank.starts else (0.0,))]
+        others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         errors = np.array(left_out)
-        # A state at zero throughout a group would ask for no estimate of it at all.
-        counted = (moments.power > 0)[:, None]
-        best = np.argmin(np.log(errors).mean(axis=0, where=counted | ~counted.any(axis=0)), axis=0)
+        best = moments.best(np.log(errors), len(candidates) // len(settings.penalties), settings)
         n = np.arange(errors.shape[2])
-        coefficients = np.array(list(moments.solved(weights, penalties)))[best, :, n].T
+        coefficients = np.array(list(moments.solved(weights, candidates)))[best, :, n].T
         return cls(
             design,
             sample,
             whitening.directions @ coefficients * design.recordings.size,
             errors[:, best, n],
             moments.errors(coefficients),
-            np.array(penalties)[best],
+            np.array(candidates)[best],
             {g: whitening.directions @ np.array(each)[best, :, n].T for g, each in others.items()},
         )
 
@@ -360,9 +380,7 @@ class Readout:
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
-        log = np.log(self.left_out[:, list(states)]).mean(axis=1)
-        folds = np.array([group.fold for group in self.others])
-        return np.array([log[folds == fold].mean() for fold in np.unique(folds)])
+        return by("fold", list(self.others), np.log(self.left_out[:, list(states)]).mean(axis=1))
 
     def episode_errors(self) -> Array:
         """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
@@ -377,6 +395,12 @@ def spread(items: Sequence[T], count: int) -> list[T]:
     return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
 
 
+def by(what: str, groups: Sequence[Group], values: Array) -> Array:
+    """Return means of values of groups over every fold, or part, shape (folds,)."""
+    names = np.array([getattr(group, what) for group in groups])
+    return np.array([values[names == name].mean() for name in np.unique(names)])
+
+
 def is_less(one: Array, other: Array, margin: float) -> bool:
     """Whether one is less than the other by so many paired standard errors."""
     difference = one - other
@@ -388,6 +412,6 @@ def condition_weights(moments: Moments) -> Array:
     """Return weights of the groups: all alike within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
     alike = conditions[:, None] == conditions
-    (first,) = moments.solved(np.ones(len(alike)), [ROUNDING])
+    (first,) = moments.solved(np.ones(len(alike)), [(ROUNDING, 1.0)])
     errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
     return alike.sum(axis=1) / (alike @ errors)

@@ -55,8 +55,16 @@ class EstimatorSettings(Settings):
     nonlinear_trust: float = Field(
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )
-    start_trust: float = Field(
-        1.0, ge=0, description="relative error of a value of the first sample: rows with target zero"
+    start_trust: tuple[float, ...] = Field(
+        (1.0, 0.1, 0.01),
+        min_length=1,
+        description="relative errors of the values of the first sample that are tried: rows with target zero",
+    )
+    start_gain: float = Field(
+        0.05,
+        ge=0,
+        lt=1,
+        description="share by which the next one has to lessen errors, since machines start elsewhere too",
     )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"

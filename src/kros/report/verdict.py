@@ -11,10 +11,10 @@ from enum import Enum
 from typing import Any
 
 from ..data.recording import some
+from ..design.task import split_name
 from .error_tables import ErrorCell, ErrorTable, tables_of
 from .facts import Facts
-from .names import BASELINES, condition_label, joined, number, observer_label, words
-from .names import split_observer as split
+from .names import condition_label, joined, label_of, number, observer_label, words
 
 Row = Mapping[str, Any]
 
@@ -222,7 +222,7 @@ def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
     if outside := facts.entry.get("set_outside"):
         text = f"Outside the set of recorded signals that the certificate covers: {some(outside)}."
         yield text, "Do not rely on the bounds for these units.", "certificates"
-    if facts.observers and all(split(name)[1] in BASELINES for name in facts.observers):
+    if facts.observers and all(label_of(name).baseline for name in facts.observers):
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
     bound = facts.get("uncertainty", {}).get(facts.model, {}).get("weight", {}).get("cover_max")
     if bound is not None and bound > 1:
@@ -255,7 +255,7 @@ def certificates(facts: Facts) -> list[str]:
     hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
     if hidden:
         parts = [" ".join(filter(None, (number(bounds[c]), facts.unit(c), "in", words(c)))) for c in hidden]
-        bank = split(facts.deployed)[1] == "estimator"
+        bank = split_name(facts.deployed)[1] == "estimator"
         source = "Measured on units left out of its regression" if bank else "For recorded signals"
         share = f"; about one new unit in {facts.study['units'] + 1} exceeds it" if bank else ""
         texts.append(f"{source}: the RMS error is at most {joined(parts)}{share}.")
@@ -283,7 +283,7 @@ def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> st
 
 def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:
     """Return the channels in which an observer is no better than its model without correction."""
-    other = f"{split(name)[0]}/open_loop"
+    other = f"{split_name(name)[0]}/open_loop"
     if name == other or other not in table.cells:
         return []
     return [c for c in channels if not _smaller(table, name, other, [c], 1 - THRESHOLDS.improved)]

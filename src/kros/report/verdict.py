@@ -105,10 +105,11 @@ def _numbers(facts: Facts) -> list[Number]:
     for channel in facts.hidden[:2]:
         cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else ErrorCell()
         if cell.mean is not None:
-            notes = [f"RMS {number(cell.rms)} {facts.unit(channel)}".strip()] if cell.rms else []
+            known = cell.means
+            notes = [f"RMS {number(known['rms'])} {facts.unit(channel)}".strip()] if known.get("rms") else []
             notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
-            if cell.true_mean:
-                notes.append(f"against the true signal: {number(cell.true_mean)} %{_lag(cell.lag_s)}")
+            if error := known.get("true_error_percent"):
+                notes.append(f"against the true signal: {number(error)} %{_lag(known.get('true_lag_s'))}")
             numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
     if rows := facts.get("outliers"):
         flagged, open_ = sorted({r["unit"] for r in rows if r["outlier"]}), undecided(rows)

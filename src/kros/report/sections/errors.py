@@ -93,12 +93,13 @@ def _channel(channel: str, unit: str, rows: Rows, details: bool) -> list[Column]
     group = words(channel)
     intervals = ["–".join(number(v, 2) for v in c.interval) if c.interval and details else "" for c in cells]
     means = ["diverged" if c.diverged else c.mean for c in cells]
+    lags = [c.means.get("true_lag_s") for c in cells]
     return [
         Column("mean (%)", means, group, best=True, notes=intervals),
         Column("worst (%)", [c.worst for c in cells], group, best=True),
-        Column(f"RMS ({unit})" if unit else "RMS", [c.rms for c in cells], group),
-        Column("against the true signal (%)", [c.true_mean for c in cells], group),
-        Column("lag (ms)", [None if c.lag_s is None else 1e3 * c.lag_s for c in cells], group),
+        Column(f"RMS ({unit})" if unit else "RMS", [c.means.get("rms") for c in cells], group),
+        Column("against the true signal (%)", [c.means.get("true_error_percent") for c in cells], group),
+        Column("lag (ms)", [None if lag is None else 1e3 * lag for lag in lags], group),
     ]
 
 

@@ -73,20 +73,20 @@ def tables_of(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None 
     return tables
 
 
-def _cell(rows: Rows, interval: Sequence[float] | None) -> ErrorCell:
+def _cell(rows: Sequence[Any], interval: Sequence[float] | None) -> ErrorCell:
     """Summarise the units of one observer and channel."""
     lost = len({r["unit"] for r in rows if r["error_percent"] is None})
     if lost:
         return ErrorCell(diverged=lost)
     worst = max(rows, key=lambda r: float(r["error_percent"]))
-    values = {key: [r.get(key) for r in rows] for key, value in rows[0].items() if not isinstance(value, str)}
-    known: dict[str, list[Any]] = {key: of_units for key, of_units in values.items() if None not in of_units}
-    means = {key: float(np.mean(of_units)) for key, of_units in known.items()}
+    numbers = (key for key, value in rows[0].items() if not isinstance(value, str))
+    known = {key: values for key in numbers if None not in (values := [r.get(key) for r in rows])}
+    means = {key: float(np.mean(values)) for key, values in known.items()}
     return ErrorCell(
         means["error_percent"],
         float(worst["error_percent"]),
         worst["unit"],
         interval,
-        worst_rms=float(max(known["rms"])) if "rms" in known else None,
+        worst_rms=max(known.get("rms", ()), default=None),
         means=means,
     )

@@ -37,7 +37,9 @@ def traced(sought: Callable[[Any], bool]) -> Iterator[list[str]]:
 
     def look(frame: FrameType, event: str, value: Any) -> None:
         name = frame.f_globals.get("__name__", "")
-        if event == "return" and re.match(r"kros\.(?!core)", name) and holds(value, sought):
+        if event != "return" or frame.f_code.co_name.endswith("comp>"):  # a comprehension is a function in 3.11 alone
+            return
+        if re.match(r"kros\.(?!core)", name) and holds(value, sought):
             modules.append(name.removeprefix("kros."))
 
     sys.setprofile(look)

@@ -31,10 +31,11 @@ import numpy as np
 import kros
 from kros.core.artifacts import write_json
 from kros.data import write_parquet
+from kros.design.task import split_name
 from kros.evaluate import unit_interval
 from kros.plants import HarmonicDrivePopulation
 from kros.report.error_tables import ErrorCell, ErrorTable, tables_of
-from kros.report.names import BASELINES, minus, number, split_observer
+from kros.report.names import label_of, minus, number
 from kros.study import load_config
 from kros.study.config import Stage
 from kros.study.engine.executors import Lines, available_cores
@@ -244,7 +245,7 @@ def asked(tables: Mapping[str, ErrorTable], facts: Facts, folds: int) -> list[st
 
 def own(name: str) -> bool:
     """Tell whether an observer is kros's own: no baseline, and not the paper's."""
-    return split_observer(name)[1] not in (*BASELINES, "mixed", "paper")
+    return not label_of(name).baseline and split_name(name)[1] not in ("mixed", "paper")
 
 
 def worst(table: ErrorTable, name: str, channel: str) -> float:

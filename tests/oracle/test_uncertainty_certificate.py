@@ -11,7 +11,7 @@ from kros.core.norms import hinf_norm
 from kros.uncertainty import Form, fit_magnitude, residual
 from kros.uncertainty.weights.cover import Cover
 from kros.uncertainty.weights.fit import fit_weight
-from kros.uncertainty.weights.proof import Method, ResidualSystems, certify
+from kros.uncertainty.weights.proof import ProofMethod, ResidualSystems, certify
 
 DT = 1e-3
 GRID = np.geomspace(0.1, 500.0, 60)
@@ -86,11 +86,11 @@ def test_a_peak_between_grid_points_is_found_and_is_the_norm() -> None:
         return np.abs(unit.frequency_response(freqs)[:, :, 0, 0])
 
     proof = certify(ratio, GRID, ratio(GRID), ResidualSystems(Form.ADDITIVE, nominal, unit).ratios(one, one), DT)
-    assert proof.method is Method.LEVEL_SETS
+    assert proof.method is ProofMethod.LEVEL_SETS
     assert proof.peak == pytest.approx(hinf_norm(unit[0]), rel=2e-5)
     assert proof.freq_hz == pytest.approx(37.77, rel=1e-4)
     assert ratio(GRID).max() < proof.peak / 2
-    assert certify(ratio, GRID, ratio(GRID), [], DT).method is Method.GRID
+    assert certify(ratio, GRID, ratio(GRID), [], DT).method is ProofMethod.GRID
 
 
 @pytest.mark.parametrize("form", ["additive", "inverse_input_multiplicative", "inverse_additive"])
@@ -98,7 +98,7 @@ def test_weights_hold_between_grid_points(form: str) -> None:
     nominal, units = population(5, 3, 2, 2)
     residuals = of_systems(form, nominal, units)
     weight, _ = fit_weight(residuals, GRID, DT, 3, 3.0)
-    assert weight.method is Method.LEVEL_SETS
+    assert weight.method is ProofMethod.LEVEL_SETS
     freqs = np.linspace(0.0, 500.0, 20001)
     assert weight.magnitudes(freqs).ratio(residuals.at(freqs)).max() <= 1
 

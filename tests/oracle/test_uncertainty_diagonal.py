@@ -53,7 +53,7 @@ def lags_and_leads(freqs: np.ndarray) -> np.ndarray:
 
 
 def test_diagonal_residuals_that_can_be_represented_are_met_with_lower_orders() -> None:
-    weight, cover = fit_weight(of_function(lags_and_leads), FREQS, DT, tolerance_db=0.3)
+    weight, cover = fit_weight(of_function(lags_and_leads), FREQS, DT, 4, 0.3)
     assert weight.overbound_db_max <= 0.3
     assert sum(weight.left_orders) + sum(weight.right_orders) <= 4  # three would do
     used = weight.magnitudes(FREQS)
@@ -72,7 +72,7 @@ def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
             None, :, None, None
         ]
 
-    four, _ = fit_weight(of_function(peaks), freqs, DT)
-    six, _ = fit_weight(of_function(peaks), freqs, DT, max_order=6)
+    four, _ = fit_weight(of_function(peaks), freqs, DT, 4, 1.0)
+    six, _ = fit_weight(of_function(peaks), freqs, DT, 6, 1.0)
     assert max(four.left_orders) <= 4 < max(six.left_orders) <= 6
     assert six.overbound_db_max < four.overbound_db_max

@@ -46,7 +46,7 @@ def test_entries_that_are_bounded_do_not_bound_the_perturbation() -> None:
     assert found.entry_excess == pytest.approx(worst, rel=1e-5)
     assert worst > 5
     for shape in ((1, 3, 2, 1), (1, 3, 2, 2)):  # not square, and singular everywhere
-        assert np.isnan(fit_entries(np.ones(shape), FREQS[:3], DT).excess)
+        assert np.isnan(fit_entries(np.ones(shape), FREQS[:3], DT, 4).excess)
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (3, 2)])
@@ -57,7 +57,7 @@ def test_entries_have_their_own_magnitudes(shape: tuple[int, int]) -> None:
     poles = np.exp(-2 * np.pi * corners * DT)
     z = np.exp(2j * np.pi * FREQS * DT)[:, None, None]
     E = gains * (0.1 + (1 - poles) / (z - poles))
-    found = fit_entries(np.array([E, 0.4 * E]), FREQS, DT, tolerance_db=0.05)
+    found = fit_entries(np.array([E, 0.4 * E]), FREQS, DT, 4, 0.05)
     np.testing.assert_array_equal(found.orders, np.ones(shape))
     loose = 20 * np.log10(np.abs(found.system.frequency_response(FREQS)) / np.abs(E))
     assert loose.min() >= -1e-9

@@ -9,7 +9,7 @@ from kros.core.lti import StateSpace
 from kros.identify.refine.metric import peak_residual
 from kros.uncertainty import quantify, residual
 from kros.uncertainty.forms import completion
-from kros.uncertainty.weights.proof import Method
+from kros.uncertainty.weights.proof import ProofMethod
 
 UNITS, DT = 210, 0.01
 
@@ -29,7 +29,7 @@ def fleet(n_units: int = UNITS, outputs: int = 2, seed: int = 0) -> StateSpace:
 def test_weights_of_a_fleet_cover_all_of_it(form, outputs):
     units, freqs, dense = fleet(outputs=outputs), np.geomspace(0.05, 49, 50), np.geomspace(1e-3, 49.9, 1500)
     found = quantify(units, form, freqs, max_order=2)
-    assert found.weight.method is Method.LEVEL_SETS
+    assert found.weight.method is ProofMethod.LEVEL_SETS
     G, Gp = found.nominal_system.frequency_response(dense), units.frequency_response(dense)
     pairs = [(residual(form, G, Gp), found.weight)]
     pairs += [(completion(form, G, Gp)[1], found.remainder)] if found.remainder else []

@@ -21,6 +21,7 @@ from ..observer.baselines.trained import Regressor, Rows
 from ..observer.residual import like_measurement_noise, one_step_covariance, one_step_residual
 from ..observer.screen import Screen
 from ..observer.sensor import delay_of
+from .task import Label
 from .validation import TrainingSet, rank
 
 
@@ -35,6 +36,14 @@ class BaselineSettings:
 
 
 DEFAULT = BaselineSettings()
+BASELINES = {
+    "ekf": Label("extended Kalman", "extended Kalman filter", "PURPLE", baseline=True),
+    "filtered_difference": Label("filtered difference", "low-pass filtered derivative", "GOLD", baseline=True),
+    "learned": Label("learned", "ridge regression on past samples", "GREEN", baseline=True),
+    "mean_profile": Label("mean profile", "mean of the same episode of other units", "GREEN", ":", baseline=True),
+    "boosting": Label("boosting", "gradient boosting on past samples", "GREEN", "--", baseline=True),
+    "network": Label("network", "neural network on past samples", "GREEN", "-.", baseline=True),
+}
 
 
 class Estimator(Protocol):

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from pydantic import Field
 
 from ..core.settings import Settings
+from ..observer.baselines.trained import Regressor
+from .baselines import BASELINES
+from .methods import METHODS
 
-METHODS = Literal["mixed", "paper", "worst_case_h2", "residual_h2", "estimator"]
-BASELINES = Literal[
-    "open_loop", "kalman_tuned", "ekf", "filtered_difference", "learned", "mean_profile", "boosting", "network"
-]
+if TYPE_CHECKING:
+    MethodName = str
+    BaselineName = str
+else:
+    MethodName = Literal[tuple(method.name for method in METHODS if not method.label.baseline)]
+    BaselineName = Literal[(*(method.name for method in METHODS if method.label.baseline), *BASELINES)]
 
 
 class SynthesisSettings(Settings):
     """Observer synthesis."""
 
-    methods: tuple[METHODS, ...] = Field(
+    methods: tuple[MethodName, ...] = Field(
         ("mixed", "worst_case_h2", "residual_h2", "estimator"),
         description="ways to an observer, each for every kind of model",
     )
@@ -31,6 +36,7 @@ class ObserverSettings(Settings):
     scikit-learn, on demand: they take minutes.
     """
 
-    baselines: tuple[BASELINES, ...] = Field(
-        get_args(BASELINES)[:-2], description="observers to compare with; boosting and network on demand"
+    baselines: tuple[BaselineName, ...] = Field(
+        tuple(name for name in get_args(BaselineName) if name not in get_args(Regressor)),
+        description="observers to compare with; boosting and network on demand",
     )

@@ -23,10 +23,22 @@ from .validation import TrainingSet, percent_of, rank
 
 
 @dataclass(frozen=True)
+class Label:
+    """What reports call a kind of observer, what it is in a few words, and how its curves look."""
+
+    text: str
+    about: str
+    tone: str = "GREY"  # of `kros.report.theme.Tone`
+    line: str = "-"
+    baseline: bool = False
+
+
+@dataclass(frozen=True)
 class Method(ABC):
     """One way to an observer; its options are fields."""
 
     name: ClassVar[str]
+    label: ClassVar[Label]
     assumes_disturbances: ClassVar[bool] = False  # chooses those that all observers of its models are certified for
 
     def refusal(self, kind: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,8 @@ class ErrorCell:
     worst_unit: str | None = None
     interval: Sequence[float] | None = None  # 95 % interval of the mean, by a bootstrap over units
     diverged: int = 0  # units whose estimate diverged
-    rms: float | None = None  # mean over units, in the channel's unit of measure
     worst_rms: float | None = None
-    true_mean: float | None = None  # against the true signal, percent of its largest value
-    lag_s: float | None = None  # of the estimate behind the true signal
+    means: Mapping[str, float] = field(default_factory=dict)  # over units, of what all have, by its key in the metrics
 
 
 @dataclass(frozen=True)
@@ -75,30 +73,20 @@ def tables_of(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None 
     return tables
 
 
-def _cell(rows: Rows, interval: Sequence[float] | None) -> ErrorCell:
+def _cell(rows: Sequence[Any], interval: Sequence[float] | None) -> ErrorCell:
     """Summarise the units of one observer and channel."""
     lost = len({r["unit"] for r in rows if r["error_percent"] is None})
     if lost:
         return ErrorCell(diverged=lost)
     worst = max(rows, key=lambda r: float(r["error_percent"]))
-    rms = _known(rows, "rms")
+    numbers = (key for key, value in rows[0].items() if not isinstance(value, str))
+    known = {key: values for key in numbers if None not in (values := [r.get(key) for r in rows])}
+    means = {key: float(np.mean(values)) for key, values in known.items()}
     return ErrorCell(
-        float(np.mean([r["error_percent"] for r in rows])),
+        means["error_percent"],
         float(worst["error_percent"]),
         worst["unit"],
         interval,
-        rms=float(np.mean(rms)) if rms else None,
-        worst_rms=float(max(rms)) if rms else None,
-        true_mean=_mean(_known(rows, "true_error_percent")),
-        lag_s=_mean(_known(rows, "true_lag_s")),
+        worst_rms=max(known.get("rms", ()), default=None),
+        means=means,
     )
-
-
-def _known(rows: Rows, key: str) -> list[float]:
-    """Return a value of every row; nothing where one is unknown."""
-    values = [r.get(key) for r in rows]
-    return [float(v) for v in values if v is not None] if None not in values else []
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return float(np.mean(values)) if values else None

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from ..design.task import split_name
 from .error_tables import ErrorTable, error_tables
-from .names import observer_label, readable_unit, split_observer
+from .names import observer_label, readable_unit
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Facts:
     @property
     def model(self) -> str:
         """Model of the deployed observer."""
-        return split_observer(self.deployed)[0]
+        return split_name(self.deployed)[0]
 
     @cached_property
     def tables(self) -> list[ErrorTable]:

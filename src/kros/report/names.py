@@ -8,37 +8,13 @@ from math import floor, isfinite, log10
 from typing import TypeVar
 
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
+from ..design.baselines import BASELINES
+from ..design.methods import METHODS
+from ..design.task import Label, split_name
 from .theme import Tone
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Method:
-    """A kind of observer: its name, what it is in a few words, its colour, and whether it is a baseline."""
-
-    label: str
-    about: str
-    tone: Tone
-    baseline: bool = False
-
-
-METHODS = {
-    "open_loop": Method("open loop", "the model without correction", Tone.GREY, True),
-    "kalman_tuned": Method("tuned Kalman", "steady-state Kalman filter, noise tuned in training", Tone.PURPLE, True),
-    "ekf": Method("extended Kalman", "extended Kalman filter", Tone.PURPLE, True),
-    "filtered_difference": Method("filtered difference", "low-pass filtered derivative", Tone.GOLD, True),
-    "learned": Method("learned", "ridge regression on past samples", Tone.GREEN, True),
-    "mean_profile": Method("mean profile", "mean of the same episode of other units", Tone.GREEN, True),
-    "boosting": Method("boosting", "gradient boosting on past samples", Tone.GREEN, True),
-    "network": Method("network", "neural network on past samples", Tone.GREEN, True),
-    "mixed": Method("mixed H2-H∞", "H2-optimal with an H∞ bound", Tone.ORANGE),
-    "paper": Method("mixed, entrywise weights", "as published", Tone.ORANGE),
-    "worst_case_h2": Method("worst-case H2", "smallest H2 norm over the set of plants", Tone.BLUE),
-    "residual_h2": Method("residual-shaped H2", "noise shaped like the recorded residuals", Tone.INK),
-    "estimator": Method("estimator", "stable filter bank with a linear readout", Tone.SKY),
-}
-BASELINES = tuple(name for name, method in METHODS.items() if method.baseline)
+LABELS = {method.name: method.label for method in METHODS} | BASELINES
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -57,12 +33,6 @@ def is_koopman(name: str) -> bool:
     return name.startswith("koopman")
 
 
-def split_observer(name: str) -> tuple[str, str]:
-    """Return model and method of an observer; the model is empty for those without one."""
-    model, _, method = name.rpartition("/")
-    return model, method
-
-
 def words(name: str) -> str:
     """Return an identifier, such as that of a channel or a form, as words."""
     return name.replace("_", " ")
@@ -74,26 +44,16 @@ def model_label(name: str) -> str:
     return f"{'Koopman' if is_koopman(name) else family}{' (EDMD)' if edmd else ''}"
 
 
-def method_of(name: str) -> Method:
-    """Return what is known of an observer's method."""
-    method = split_observer(name)[1]
-    return METHODS.get(method, Method(words(method), "", Tone.GREY))
-
-
-def method_label(name: str) -> str:
-    """Return what an observer's method is called."""
-    return method_of(name).label
+def label_of(name: str) -> Label:
+    """Return the label of an observer's method."""
+    method = split_name(name)[1]
+    return LABELS.get(method, Label(words(method), ""))
 
 
 def observer_label(name: str) -> str:
     """Return what an observer is called, for example ``Koopman (EDMD), worst-case H2``."""
-    model = split_observer(name)[0]
-    return f"{model_label(model)}, {method_label(name)}" if model else method_label(name)
-
-
-def observer_about(name: str) -> str:
-    """Return what an observer is, in a few words."""
-    return method_of(name).about
+    model, text = split_name(name)[0], label_of(name).text
+    return f"{model_label(model)}, {text}" if model else text
 
 
 def model_look(name: str) -> Look:
@@ -103,14 +63,14 @@ def model_look(name: str) -> Look:
 
 def method_look(name: str) -> Look:
     """Return how an observer's curves look beside others of the same model: the hue of its method."""
-    styles = {"kalman_tuned": "--", "mean_profile": ":", "boosting": "--", "network": "-.", "estimator": "-."}
-    return Look(method_of(name).tone.light, styles.get(split_observer(name)[1], "-"))
+    label = label_of(name)
+    return Look(Tone[label.tone].light, label.line)
 
 
 def observer_look(name: str) -> Look:
     """Return how an observer's curves look beside others: the hue of its model, of a baseline that of its method."""
-    model = split_observer(name)[0]
-    return method_look(name) if method_of(name).baseline or not model else model_look(model)
+    model = split_name(name)[0]
+    return method_look(name) if label_of(name).baseline or not model else model_look(model)
 
 
 def linear_first(by_model: Mapping[str, T]) -> dict[str, T]:
@@ -122,15 +82,15 @@ def observer_pair(names: Iterable[str], first: str | None = None) -> list[str]:
     """Return an observer, by default the first, behind that of its method for the other model; else a baseline."""
     known = list(names)
     first = first if first in known else next(iter(known), "")
-    model, method = split_observer(str(first))
-    rivals = [n for n in known if split_observer(n)[1] == method] + [f"{model}/kalman_tuned", "learned"]
+    model, method = split_name(str(first))
+    rivals = [n for n in known if split_name(n)[1] == method] + [f"{model}/kalman_tuned", "learned"]
     rival = next((n for n in rivals if n in known and n != first), None)
     return [n for n in (rival, first) if n]
 
 
 def published(names: Iterable[str]) -> list[str]:
     """Return the paper's observers, those with entrywise weights first."""
-    return [n for n in names if split_observer(n)[1] in ("paper", "mixed")]
+    return [n for n in names if split_name(n)[1] in ("paper", "mixed")]
 
 
 def readable_unit(unit: str) -> str:

@@ -11,10 +11,10 @@ from enum import Enum
 from typing import Any
 
 from ..data.recording import some
+from ..design.task import split_name
 from .error_tables import ErrorCell, ErrorTable, tables_of
 from .facts import Facts
-from .names import BASELINES, condition_label, joined, number, observer_label, words
-from .names import split_observer as split
+from .names import condition_label, joined, label_of, number, observer_label, words
 
 Row = Mapping[str, Any]
 
@@ -105,10 +105,11 @@ def _numbers(facts: Facts) -> list[Number]:
     for channel in facts.hidden[:2]:
         cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else ErrorCell()
         if cell.mean is not None:
-            notes = [f"RMS {number(cell.rms)} {facts.unit(channel)}".strip()] if cell.rms else []
+            known = cell.means
+            notes = [f"RMS {number(known['rms'])} {facts.unit(channel)}".strip()] if known.get("rms") else []
             notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
-            if cell.true_mean:
-                notes.append(f"against the true signal: {number(cell.true_mean)} %{_lag(cell.lag_s)}")
+            if error := known.get("true_error_percent"):
+                notes.append(f"against the true signal: {number(error)} %{_lag(known.get('true_lag_s'))}")
             numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
     if rows := facts.get("outliers"):
         flagged, open_ = sorted({r["unit"] for r in rows if r["outlier"]}), undecided(rows)
@@ -222,11 +223,12 @@ def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
     if outside := facts.entry.get("set_outside"):
         text = f"Outside the set of recorded signals that the certificate covers: {some(outside)}."
         yield text, "Do not rely on the bounds for these units.", "certificates"
-    if facts.observers and all(split(name)[1] in BASELINES for name in facts.observers):
+    if facts.observers and all(label_of(name).baseline for name in facts.observers):
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
     bound = facts.get("uncertainty", {}).get(facts.model, {}).get("weight", {}).get("cover_max")
     if bound is not None and bound > 1:
-        yield "The weights do not bound all units that they were fitted to.", "Raise their order.", "uncertainty"
+        action = "Use kros.quantify(models, max_order=6) in Python."
+        yield "The weights do not bound all units that they were fitted to.", action, "uncertainty"
     for fold, why in facts.get("left_out", {}).get("failed", {}).items():
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
 
@@ -255,7 +257,7 @@ def certificates(facts: Facts) -> list[str]:
     hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
     if hidden:
         parts = [" ".join(filter(None, (number(bounds[c]), facts.unit(c), "in", words(c)))) for c in hidden]
-        bank = split(facts.deployed)[1] == "estimator"
+        bank = split_name(facts.deployed)[1] == "estimator"
         source = "Measured on units left out of its regression" if bank else "For recorded signals"
         share = f"; about one new unit in {facts.study['units'] + 1} exceeds it" if bank else ""
         texts.append(f"{source}: the RMS error is at most {joined(parts)}{share}.")
@@ -283,7 +285,7 @@ def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> st
 
 def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:
     """Return the channels in which an observer is no better than its model without correction."""
-    other = f"{split(name)[0]}/open_loop"
+    other = f"{split_name(name)[0]}/open_loop"
     if name == other or other not in table.cells:
         return []
     return [c for c in channels if not _smaller(table, name, other, [c], 1 - THRESHOLDS.improved)]

@@ -6,25 +6,22 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from ..core.arrays import AnyArray, ArrayLike
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace
 from ..core.rounding import ITERATED
-from ..core.settings import Settings
 from .forms import check_responses
+from .settings import WeightSettings
 
 
-class Options(Settings):
+class Options(WeightSettings):
     """Options of `quantify` for systems and responses, described there."""
 
     unit_ids: tuple[str, ...] | None = None
     output_scale: Any = None
     input_scale: Any = None
     nominal: str | int | None = None
-    max_order: int = Field(4, ge=0)
-    tolerance_db: float = Field(1.0, ge=0)
     sample_period_s: float | None = None
 
     def scales(self, shape: tuple[int, ...]) -> tuple[AnyArray, AnyArray]:

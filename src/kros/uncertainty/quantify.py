@@ -30,7 +30,7 @@ from .model import UncertainModel
 from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
-from .settings import QuantifySettings
+from .settings import QuantifySettings, WeightSettings
 from .unit_residuals import UnitResiduals, unit_residuals
 
 _KIND = "choice"
@@ -181,8 +181,8 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
         raise IdentificationError(f"{problem}; record more units in the condition that feeds synthesis.")
     responses = first.scaled_responses(first.frequencies(settings.n_freqs), units)
     nominal = settings.nominal or units[choose_nominal(responses, settings.form).index]  # as in the paper, for all
-    same = {"max_order": settings.max_order, "tolerance_db": settings.tolerance_db}
-    options = Options(unit_ids=tuple(units), nominal=nominal, **same)
+    weight = {name: getattr(settings, name) for name in WeightSettings.model_fields}
+    options = Options(unit_ids=tuple(units), nominal=nominal, **weight)
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
     tasks = [partial(bound_systems, *one, options) for one in every]
     sets = dict(zip(models.kinds, work.run("quantify", tasks), strict=True))

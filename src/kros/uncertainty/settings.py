@@ -20,6 +20,13 @@ FORMS = Literal[
 ]
 
 
+class WeightSettings(Settings):
+    """How weights are fitted."""
+
+    max_order: int = Field(4, ge=0, description="largest order of an entry of a weight")
+    tolerance_db: float = Field(1.0, ge=0, description="how far a weight may be above the bound of the residuals")
+
+
 class UncertaintySettings(Settings):
     """Uncertainty model and outlier scores: the keys of a study."""
 
@@ -28,12 +35,10 @@ class UncertaintySettings(Settings):
     outlier_form: FORMS = Field("additive", description="of the residuals that outlier scores are made of")
 
 
-class QuantifySettings(UncertaintySettings):
+class QuantifySettings(UncertaintySettings, WeightSettings):
     """What `kros.quantify` takes beside models; a study has the defaults of what is no key of it."""
 
     nominal: str | None = Field(None, description="a unit; by default the one with the lowest peak residual")
-    max_order: int = Field(4, ge=1, le=8, description="largest order of an entry of a weight")
-    tolerance_db: float = Field(1.0, gt=0, description="how far a weight may be above the bound of the residuals")
     false_alarm_rate: float = Field(1e-2, gt=0, lt=1, description="probability that a unit like the others is flagged")
 
 
@@ -119,8 +124,10 @@ class SetRule:
     warned: float = 0.01  # misfit from which on another form is worth a thought
     resolved: float = 10 ** (3 / 20)  # fall of a bound beside a peak beyond which frequencies do not resolve it
     entry_order: int = 3  # of fits to single entries, which are shown and decide nothing
+    entry_db: float = 1.0  # above an entry, at which a lower order of its fit is good enough
     singular: float = 1e10  # condition beyond which the paper's weights have no inverse
     at_once: int = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
 
 
-FIT, MAGNITUDE, PROOF, OUTLIER, SET = FitRule(), MagnitudeRule(), ProofRule(), OutlierRule(), SetRule()
+WEIGHT, FIT, MAGNITUDE, PROOF = WeightSettings(), FitRule(), MagnitudeRule(), ProofRule()
+OUTLIER, SET = OutlierRule(), SetRule()

@@ -79,7 +79,7 @@ class EntryWeights:
 
 
 def fit_entries(
-    E: AnyArray, freqs_hz: AnyArray, sample_period_s: float, max_order: int = 4, tolerance_db: float = 1.0
+    E: AnyArray, freqs_hz: AnyArray, sample_period_s: float, max_order: int, tolerance_db: float = SET.entry_db
 ) -> EntryWeights:
     """Return one magnitude for every entry of residuals (unit, frequency, p', m')."""
     p, m = E.shape[2:]

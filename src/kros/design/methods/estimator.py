@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 
 from ...observer import EstimatorSettings, Recordings, Seen, identify_estimator
 from ...observer.sensor import Sensor
 from ...synthesis import Status, Synthesis
-from ..task import Design, DesignTask, Method
+from ..task import Design, DesignTask, Label, Method
 
 
 @dataclass(frozen=True)
 class Estimator(Method):
     """Regression on filtered measurements and inputs; it is trained with the declared sensors."""
 
-    name: ClassVar[str] = "estimator"
+    name = "estimator"
+    label = Label("estimator", "stable filter bank with a linear readout", "SKY", "-.")
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
 
     def design(self, task: DesignTask) -> Design:

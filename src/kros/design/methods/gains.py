@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from ...observer.residual import (
 )
 from ...synthesis import Synthesis, kalman
 from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
-from ..task import Design, DesignTask, Method
+from ..task import Design, DesignTask, Label, Method
 from ..validation import hidden_mean, percent_of
 
 
@@ -35,7 +34,8 @@ from ..validation import hidden_mean, percent_of
 class OpenLoop(Method):
     """The nominal model without correction."""
 
-    name: ClassVar[str] = "open_loop"
+    name = "open_loop"
+    label = Label("open loop", "the model without correction", baseline=True)
 
     def design(self, task: DesignTask) -> Design:
         """Return the model alone."""
@@ -46,7 +46,8 @@ class OpenLoop(Method):
 class KalmanTuned(Method):
     """The Kalman filter of a model fitted to single steps, whose process noise does best in training."""
 
-    name: ClassVar[str] = "kalman_tuned"
+    name = "kalman_tuned"
+    label = Label("tuned Kalman", "steady-state Kalman filter, noise tuned in training", "PURPLE", "--", baseline=True)
 
     def design(self, task: DesignTask) -> Design:
         """Return the candidate of least error of the hidden states; process noise is like the one-step residuals."""
@@ -89,7 +90,8 @@ def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:
 class ResidualH2(Method):
     """Kalman gains for the one-step residuals that a model leaves on the training episodes of all units."""
 
-    name: ClassVar[str] = "residual_h2"
+    name = "residual_h2"
+    label = Label("residual-shaped H2", "noise shaped like the recorded residuals", "INK")
     max_order: int = 12  # of the observer beside the model
     compared: int = 3  # most promising models that are tried on training episodes
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -17,14 +17,15 @@ from ...identify.model_set import EDMD
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...uncertainty import residual
 from ...uncertainty.unit_residuals import EntryWeights, fit_entries
-from ..task import Design, DesignTask, Method
+from ..task import Design, DesignTask, Label, Method
 
 
 @dataclass(frozen=True)
 class Mixed(Method):
     """The paper's mixed H2/H-infinity problem on the reduced, regularised plant, corrected through the input."""
 
-    name: ClassVar[str] = "mixed"
+    name = "mixed"
+    label = Label("mixed H2-H∞", "H2-optimal with an H∞ bound", "ORANGE")
     steps: int = 400  # of the optimisation, at most
 
     def refusal(self, kind: str) -> str:
@@ -41,7 +42,8 @@ class Mixed(Method):
 class Published(Mixed):
     """The mixed problem with a weight for every entry of the residual, as in the paper's Figures 8 and 10."""
 
-    name: ClassVar[str] = "paper"
+    name = "paper"
+    label = Label("mixed, entrywise weights", "as published", "ORANGE")
     max_order: int = 4  # of the weight of an entry
 
     def design(self, task: DesignTask) -> Design:
@@ -96,8 +98,9 @@ class Disturbances:
 class WorstCaseH2(Method):
     """Worst-case H2 with the disturbances whose observer does best on training episodes."""
 
-    name: ClassVar[str] = "worst_case_h2"
-    assumes_disturbances: ClassVar[bool] = True
+    name = "worst_case_h2"
+    label = Label("worst-case H2", "smallest H2 norm over the set of plants", "BLUE")
+    assumes_disturbances = True
     corners: tuple[float | None, ...] = (None, 3e-5, 1e-3)  # see `Disturbances`
     noises: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))
     tolerance_db: float = 3.0  # of the shaping filters

@@ -142,7 +142,8 @@ class Design:
 
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
         """
-        samples = thinned(recordings.lengths, rows, round(10 * max(self.settings.start, default=0.0)))
+        first = round(self.settings.start_rows * max(self.settings.start, default=0.0))
+        samples = thinned(recordings.lengths, rows, first)
         measured = list(self.channels.measured)
         for key, (at, weights) in zip(recordings.keys, samples, strict=True):
             states, y, v = self.episode(recordings.read(key), offset)

@@ -33,6 +33,9 @@ class EstimatorSettings(Settings):
     lag_ratio: float = Field(2.0, gt=1, description="ratio of successive time constants")
     last_lag: float = Field(0.1, gt=0, description="longest time constant, as a share of the median training episode")
     start: tuple[float, ...] = Field((2.0, 8.0, 32.0), description="further time constants of the start, in samples")
+    start_rows: float = Field(
+        10.0, ge=0, description="time during which rows of the regression are denser, in the longest of these"
+    )
     features: int = Field(32, ge=0, description="random features of the richest family of channels")
     margin: float = Field(
         1.0, ge=0, description="standard errors over left-out units by which a richer family has to be better"

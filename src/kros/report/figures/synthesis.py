@@ -7,21 +7,21 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ...core.lti import StateSpace
+from ...design.task import split_name
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis
 from ..canvas import Axes, Figure, decibel, frequency_axis, grid, legend
-from ..names import BASELINES, method_label, method_look, model_label, split_observer
+from ..names import label_of, method_look, model_label
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone
-
-_WITHOUT = (*BASELINES, "estimator")  # no correction of a model by design
 
 Curve = tuple[str, np.ndarray, str, str]
 
 
 def bode(run: RunFolder) -> tuple[Figure, str]:
     """Draw plant, weights and filters, linear beside Koopman (the paper's Figure 10)."""
-    robust = {n: s for n, s in run.syntheses.items() if split_observer(n)[1] not in _WITHOUT}
+    designed = {n: s for n, s in run.syntheses.items() if not label_of(n).baseline}
+    robust = {n: s for n, s in designed.items() if split_name(n)[1] != "estimator"}  # which corrects no model
     chosen = [m for m in run.models if any(n.startswith(f"{m}/") for n in robust)]
     if not chosen:
         raise NotShownError("no robust observer has been synthesized")
@@ -46,7 +46,7 @@ def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis]) -> li
         curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN.light, "--"))
     for observer, synthesis in syntheses.items():
         response, look = scaled_filter(synthesis, models).frequency_response(freqs), method_look(observer)
-        curves.append((f"K {method_label(observer)}", response, look.colour, look.style))
+        curves.append((f"K {label_of(observer).text}", response, look.colour, look.style))
     return curves
 
 

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from ...core.linalg import radius_text
+from ...design.task import split_name
 from ..content import Column, Section, Table, build
 from ..error_tables import ErrorCell
 from ..facts import Facts
-from ..names import BASELINES, axis_label, minus, observer_label, split_observer
+from ..names import axis_label, label_of, minus, observer_label
 
 _TEXT = (
     "For the set of plants: a bound on the H2 norm of the error for every plant between the weights, and a lower bound "
@@ -47,9 +48,9 @@ def certificates(facts: Facts) -> Section | None:
 
 def _table(facts: Facts) -> Table | None:
     """Return one row an observer with a model."""
-    entries = {n: e for n, e in facts.observers.items() if e.get("status") != "failed" and split_observer(n)[0]}
+    entries = {n: e for n, e in facts.observers.items() if e.get("status") != "failed" and split_name(n)[0]}
     rows, errors = list(entries.values()), facts.tables[0].cells if facts.tables else {}
-    robust = [split_observer(n)[1] not in BASELINES for n in entries]  # a baseline's optimum bounds no worst case
+    robust = [not label_of(n).baseline for n in entries]  # a baseline's optimum bounds no worst case
     bounds = [e.get("lower_bound") or None if r else None for e, r in zip(rows, robust, strict=True)]
     gaps = [e.get("gap_percent") if b else None for e, b in zip(rows, bounds, strict=True)]
     radii = [e.get("spectral_radius_max") for e in rows]

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..content import Column, Section, Table, build
 from ..facts import Facts
-from ..names import axis_label, joined, number, observer_about, words
+from ..names import axis_label, joined, label_of, number, words
 
 _ERRORS = {
     "noise": "white noise, standard deviation",
@@ -25,7 +25,8 @@ def deployment(facts: Facts) -> Section | None:
     """Return the card of the deployed observer; None where there is none."""
     if not facts.deployed:
         return None
-    about = f": {observer_about(facts.deployed)}" if observer_about(facts.deployed) else ""
+    about = label_of(facts.deployed).about
+    about = f": {about}" if about else ""
     assumed = "; ".join(facts.entry.get("assumptions") or ())
     card = [
         ("Observer", [f"{facts.label}{about} (observers/deployed.json)."]),

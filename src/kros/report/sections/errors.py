@@ -4,21 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from ...design.task import split_name
 from ..content import Column, Section, Table, build
 from ..error_tables import ErrorCell, ErrorTable, tables_of
 from ..facts import Facts
-from ..names import (
-    BASELINES,
-    condition_label,
-    in_condition,
-    joined,
-    number,
-    observer_about,
-    observer_label,
-    published,
-    split_observer,
-    words,
-)
+from ..names import condition_label, in_condition, joined, label_of, number, observer_label, published, words
 
 Rows = Sequence[tuple[ErrorTable, str]]
 _TEXT = (
@@ -34,7 +24,7 @@ def errors(facts: Facts) -> Section | None:
     if not tables:
         return None
     roles = _compared(facts)
-    notes = ["; ".join(filter(None, (joined(role), observer_about(name)))) for name, role in roles.items()]
+    notes = ["; ".join(filter(None, (joined(role), label_of(name).about))) for name, role in roles.items()]
     about = [Column("observer", [observer_label(n) for n in roles], notes=notes)]
     caption = f"Observers to compare{in_condition(tables[0].condition)}"
     first = _table(caption, about, [(tables[0], name) for name in roles], facts)
@@ -103,12 +93,13 @@ def _channel(channel: str, unit: str, rows: Rows, details: bool) -> list[Column]
     group = words(channel)
     intervals = ["–".join(number(v, 2) for v in c.interval) if c.interval and details else "" for c in cells]
     means = ["diverged" if c.diverged else c.mean for c in cells]
+    lags = [c.means.get("true_lag_s") for c in cells]
     return [
         Column("mean (%)", means, group, best=True, notes=intervals),
         Column("worst (%)", [c.worst for c in cells], group, best=True),
-        Column(f"RMS ({unit})" if unit else "RMS", [c.rms for c in cells], group),
-        Column("against the true signal (%)", [c.true_mean for c in cells], group),
-        Column("lag (ms)", [None if c.lag_s is None else 1e3 * c.lag_s for c in cells], group),
+        Column(f"RMS ({unit})" if unit else "RMS", [c.means.get("rms") for c in cells], group),
+        Column("against the true signal (%)", [c.means.get("true_error_percent") for c in cells], group),
+        Column("lag (ms)", [None if lag is None else 1e3 * lag for lag in lags], group),
     ]
 
 
@@ -116,10 +107,10 @@ def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
     """Return the few observers that answer most questions, each with the roles it is compared in."""
     table, entries = facts.tables[0], facts.observers
     channels = table.hidden(facts.measured)
-    designed = [n for n in table.cells if split_observer(n)[1] not in BASELINES]
+    designed = [n for n in table.cells if not label_of(n).baseline]
     certified = [n for n in designed if entries.get(n, {}).get("worst_case_h2") is not None]
     certified = certified or [n for n in designed if entries.get(n, {}).get("set_certified")]
-    tuned = [n for n in table.cells if split_observer(n)[1] == "kalman_tuned"]
+    tuned = [n for n in table.cells if split_name(n)[1] == "kalman_tuned"]
 
     def best(names: Sequence[str]) -> str | None:
         return min(names, key=lambda name: table.mean(name, channels), default=None)

@@ -27,7 +27,7 @@ from ...core.lti import StateSpace
 from ...core.rounding import EPS, TINY
 from ..forms import evenly
 from ..settings import FIT, PROOF
-from .proof import Method
+from .proof import ProofMethod
 
 _STEP = np.cbrt(EPS)  # nepers, of differences
 
@@ -63,7 +63,7 @@ class Weight:
     right_orders: tuple[int, ...]
     cover_max: float = np.nan  # largest `sigma_max(W_L^-1 E_k W_R^-1)` over units and the dense grid; at most one
     overbound_db_max: float = np.nan  # dB: largest excess of `Cover.cost_db` over the optimal cover
-    method: Method = Method.GRID  # how the bound between grid points is known, see `proof`
+    method: ProofMethod = ProofMethod.GRID  # how the bound between grid points is known, see `proof`
 
     def magnitudes(self, freqs_hz: ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""

@@ -24,7 +24,7 @@ from .proof import Certificate, ResidualSystems, certify
 
 
 def fit_weight(
-    residuals: Residuals, freqs_hz: AnyArray, sample_period_s: float, max_order: int = 4, tolerance_db: float = 1.0
+    residuals: Residuals, freqs_hz: AnyArray, sample_period_s: float, max_order: int, tolerance_db: float
 ) -> tuple[Weight, Cover]:
     """Return diagonal weights that cover all units at all frequencies, and the optimal cover at `freqs_hz`.
 

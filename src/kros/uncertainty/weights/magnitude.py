@@ -41,7 +41,7 @@ from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
 from ...core.rounding import EPS, TINY
-from ..settings import MAGNITUDE
+from ..settings import MAGNITUDE, WEIGHT
 from .sections import Sections
 
 _LOG = logging.getLogger(__name__)
@@ -65,8 +65,8 @@ def fit_magnitude(
     magnitude: ArrayLike,
     sample_period_s: float,
     *,
-    max_order: int = 4,
-    tolerance_db: float = 1.0,
+    max_order: int = WEIGHT.max_order,
+    tolerance_db: float = WEIGHT.tolerance_db,
 ) -> FittedMagnitude:
     r"""Return a discrete system whose magnitude is the tightest uniform bound of the data.
 

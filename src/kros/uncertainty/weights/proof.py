@@ -38,7 +38,7 @@ Ratio = Callable[[AnyArray], AnyArray]
 _LOG = logging.getLogger(__name__)
 
 
-class Method(str, Enum):
+class ProofMethod(str, Enum):
     """How the bound between grid points is known."""
 
     GRID = "grid"
@@ -49,7 +49,7 @@ class Method(str, Enum):
 class Certificate:
     """Largest ratio over all frequencies, attained at `freq_hz`."""
 
-    method: Method
+    method: ProofMethod
     peak: float
     freq_hz: float
 
@@ -63,15 +63,15 @@ def certify(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray, pencils: list[Des
     """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, by level sets if possible."""
     freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))
     if not pencils or peak <= 0 or not _trusted(pencils, freqs_hz, known, dt):
-        return Certificate(Method.GRID, peak, freq)
+        return Certificate(ProofMethod.GRID, peak, freq)
     for _ in range(PROOF.levels):
         points = np.unique(np.concatenate([_candidates(p, peak * (1 + PROOF.margin), dt) for p in pencils]))
         values = ratio(points).max(axis=0)
         top = int(values.argmax())
         if values[top] <= peak * (1 + PROOF.margin):
-            return Certificate(Method.LEVEL_SETS, peak, freq)
+            return Certificate(ProofMethod.LEVEL_SETS, peak, freq)
         peak, freq = float(values[top]), float(points[top])
-    return Certificate(Method.GRID, peak, freq)
+    return Certificate(ProofMethod.GRID, peak, freq)
 
 
 def _sharpened(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray) -> tuple[float, float]:

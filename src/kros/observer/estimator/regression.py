@@ -247,6 +247,7 @@ class Moments:
     gram: Array  # (groups, r, r)
     cross: Array  # (groups, r, n)
     power: Array  # (groups, n)
+    rows: Array  # (groups,)
 
     @classmethod
     def of(cls, designs: Sequence[Design], whitenings: Sequence[Whitening]) -> list[Moments]:
@@ -261,9 +262,10 @@ class Moments:
         moments = []
         for whitening, total in zip(whitenings, sums, strict=True):
             r, mean = whitening.directions.shape[1], np.stack([*total.values()])
-            mean /= mean[:, -1:, -1:]
+            count = mean[:, -1, -1].copy()
+            mean /= count[:, None, None]
             power = np.diagonal(mean, axis1=1, axis2=2)[:, r:-1]
-            moments.append(cls(whitening, tuple(total), mean[:, :r, :r], mean[:, :r, r:-1], power))
+            moments.append(cls(whitening, tuple(total), mean[:, :r, :r], mean[:, :r, r:-1], power, count))
         return moments
 
     def of_groups(self, what: str) -> AnyArray:
@@ -410,9 +412,9 @@ def is_less(one: Array, other: Array, margin: float) -> bool:
 
 
 def condition_weights(moments: Moments) -> Array:
-    """Return weights of the groups: all alike within a condition, conditions inversely to the errors of a first fit."""
+    """Return weights of the groups: by rows within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
     alike = conditions[:, None] == conditions
-    (first,) = moments.solved(np.ones(len(alike)), [(ROUNDING, 1.0)])
+    (first,) = moments.solved(moments.rows, [(ROUNDING, 1.0)])
     errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
-    return alike.sum(axis=1) / (alike @ errors)
+    return moments.rows * alike.sum(axis=1) / (alike @ errors)

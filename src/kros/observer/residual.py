@@ -107,7 +107,9 @@ def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], 
     size -= size % 2
     x = [residual[:length, i].T for i, length in enumerate(lengths.tolist())]
     options: dict[str, Any] = {"nperseg": size, "detrend": False, "return_onesided": False}
-    total = np.moveaxis([csd(one[None], one[:, None], **options)[1][..., : size // 2 + 1] for one in x], -1, 1)
+    total = np.moveaxis(
+        np.array([csd(one[None], one[:, None], **options)[1][..., : size // 2 + 1] for one in x]), -1, 1
+    )
     if not np.isfinite(total).all():
         raise DataError(
             "Residual spectra: the residual contains NaN or infinity; look at the recordings and the nominal model."

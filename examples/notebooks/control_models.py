@@ -6,7 +6,7 @@ I have a model of every machine. What are the nominal model and the weights for 
 
 The models may come from any identification. You need no recordings, liftings or observers. The models are ``control.ss`` or
 ``control.frd`` with a sampling period (``sample`` gives a continuous model one, ``kros.interop.from_control`` converts a
-``control.tf``). Nominal and weights are returned as systems of python-control.
+``control.tf``). ``kros.interop.to_control`` converts nominal and weights.
 """
 
 # %%
@@ -62,14 +62,14 @@ print(models["axis 1"])
 # differences between the outputs; ``misfit`` is the approximation error.
 
 import kros
-from kros.interop import uncertainty_to_control
+from kros.interop import to_control
 from kros.uncertainty import Form
 
 freqs_hz = np.geomspace(0.1, 100, 120)
-results = {form: uncertainty_to_control(kros.quantify(models, form, freqs_hz)) for form in Form}
+results = {form: kros.quantify(models, form, freqs_hz) for form in Form}
 print("form                           nominal  peak (dB)  misfit  states of the weights")
-for form, result in results.items():
-    model, states = result.model, f"{result.left.nstates} and {result.right.nstates}"
+for form, model in results.items():
+    states = f"{model.weight.left.n_states} and {model.weight.right.n_states}"
     peak, misfit = model.peak_db[form], model.misfit_max
     print(f"{form.value:30s} {model.nominal_id:8s} {peak:9.1f}  {misfit:6.3f}  {states}")
 
@@ -82,7 +82,7 @@ for form, result in results.items():
 import matplotlib.pyplot as plt
 
 figure, axes = plt.subplots(figsize=(7.4, 3.6), layout="constrained")
-found = results[Form.OUTPUT_MULTIPLICATIVE].model
+found = results[Form.OUTPUT_MULTIPLICATIVE]
 for form in Form:
     size_db = 20 * np.log10(found.bounds[form])
     axes.semilogx(found.freqs_hz, size_db, label=form.value.replace("_", " "))
@@ -96,16 +96,16 @@ plt.show()
 # Nominal and weights
 # -------------------
 #
-# The result consists of python-control systems. ``certificate`` states where the bound holds.
+# ``to_control`` makes systems of python-control of them. The bound holds at all frequencies.
 
-chosen = results[Form.OUTPUT_MULTIPLICATIVE]
-print("nominal:", chosen.model.nominal_id)
-print("states of the weights:", chosen.left.nstates, "and", chosen.right.nstates)
-print(chosen.certificate)
+nominal = to_control(found.nominal_system, name="nominal")
+left, right = to_control(found.weight.left, name="left"), to_control(found.weight.right, name="right")
+print("nominal:", found.nominal_id)
+print("states of nominal and weights:", nominal.nstates, left.nstates, right.nstates)
 
 # %%
-print(chosen.model.summary())
-chosen.model.plot()
+print(found.summary())
+found.plot()
 
 # %%
 # Check it by hand
@@ -122,19 +122,19 @@ def response(system):
     return np.moveaxis(system(np.exp(1j * omega * system.dt), squeeze=False), -1, 0)
 
 
-scale_out, scale_in = chosen.model.output_scale[:, None], chosen.model.input_scale
-nominal = response(chosen.scaled_nominal)
-left, right = response(chosen.left), response(chosen.right)
+scale_out, scale_in = found.output_scale[:, None], found.input_scale
+scaled_nominal = response(nominal) / scale_out * scale_in
+left, right = response(left), response(right)
 
 figure, axes = plt.subplots(figsize=(7.4, 3.2), layout="constrained")
 largest = {}
 for name, system in models.items():
     scaled = response(system) / scale_out * scale_in
-    residual = (scaled - nominal) @ np.linalg.pinv(nominal)
+    residual = (scaled - scaled_nominal) @ np.linalg.pinv(scaled_nominal)
     delta = np.linalg.inv(left) @ residual @ np.linalg.inv(right)
     size = np.linalg.norm(delta, ord=2, axis=(1, 2))
     largest[name] = size.max()
-    if name != chosen.model.nominal_id:
+    if name != found.nominal_id:
         axes.semilogx(omega / (2 * np.pi), size, label=name)
 axes.axhline(1, color="k", linewidth=0.8)
 axes.set(xlabel="frequency (Hz)", ylabel="residual over the weights", ylim=(0, 1.4))
@@ -149,7 +149,7 @@ print(f"largest over all axes and frequencies: {max(largest.values()):.5f}")
 # The weights are stable and minimum phase, ready for a generalized plant: `control.mixsyn`, or `kros.synthesis.hinf` with a certificate that is recomputed
 # from the closed loop. The same works for measured frequency responses (``control.frd``), where the bound holds at the frequencies given.
 
-print("poles of the left weight, stable:", bool(np.all(np.abs(chosen.left.poles()) < 1)))
+print("poles of the left weight, stable:", bool(np.all(np.abs(to_control(found.weight.left).poles()) < 1)))
 points = 2 * np.pi * freqs_hz
 measured = [control.frd(system, points) for system in models.values()]
 print(kros.quantify(measured, Form.OUTPUT_MULTIPLICATIVE).certificate)

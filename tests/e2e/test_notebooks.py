@@ -40,8 +40,8 @@ def test_control_models(run):
     assert len(found["largest"]) == 8
     assert 0.99 < max(found["largest"].values()) <= 1  # recomputed in the notebook, with a finer grid
     form = found["Form"].OUTPUT_MULTIPLICATIVE
-    assert found["chosen"].model.peak_db[form] < -10
-    assert found["chosen"].model.misfit_max < 1e-9
+    assert found["found"].peak_db[form] < -10
+    assert found["found"].misfit_max < 1e-9
 
 
 def test_every_notebook_is_tested_and_in_the_documentation():

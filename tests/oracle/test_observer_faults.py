@@ -272,7 +272,7 @@ def test_what_does_not_fit_is_named():
     for make in (
         lambda: o.start([0.0], {"phse": 1.0}),
         lambda: run_observer(o, y, u, {"phse": 1.0}),
-        lambda: running.parameters.update(phse=1.0),
+        lambda: setattr(running, "parameters", {"phse": 1.0}),
     ):
         with pytest.raises(ConfigError, match="'phse' is unknown; its lifting has phase"):
             make()

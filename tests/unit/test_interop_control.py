@@ -11,7 +11,7 @@ import pytest
 from kros.core import DimensionError, StateSpace
 from kros.data import Channel, Role
 from kros.identify import ModelSet
-from kros.interop import from_control, to_control, uncertainty_to_control
+from kros.interop import from_control, to_control
 from kros.lifting import Lifting
 from kros.uncertainty import quantify
 
@@ -103,12 +103,11 @@ def test_names_have_no_dots() -> None:
 def test_weights_cover_the_residuals_in_python_control_too() -> None:
     population = models()
     model = quantify(population, form="additive", freqs_hz=np.geomspace(0.1, 45.0, 20))
-    out = uncertainty_to_control(model)
+    scaled, weights = to_control(model.scaled_nominal()), map(to_control, (model.weight.left, model.weight.right))
+    left, right = (np.moveaxis(w.frequency_response(2 * np.pi * FREQS_HZ).frdata, -1, 0) for w in weights)
     for unit in population.unit_ids:
         other = dataclasses.replace(model, nominal_system=population.systems([unit])[0]).scaled_nominal()
-        difference = to_control(other) - out.scaled_nominal
+        difference = to_control(other) - scaled
         E = np.moveaxis(difference.frequency_response(2 * np.pi * FREQS_HZ).frdata, -1, 0)
-        left = np.moveaxis(out.left.frequency_response(2 * np.pi * FREQS_HZ).frdata, -1, 0)
-        right = np.moveaxis(out.right.frequency_response(2 * np.pi * FREQS_HZ).frdata, -1, 0)
         covered = np.linalg.solve(left, E) @ np.linalg.inv(right)
         assert np.linalg.norm(covered, 2, axis=(-2, -1)).max() <= 1 + 1e-6

@@ -54,9 +54,9 @@ score_outliers return.
     kros.uncertainty: Cover FittedMagnitude NominalChoice OutlierScore Weight
 Bounds of residuals over every nominal are no longer a function; use sigma_max of residual, or choose_nominal.
     kros.uncertainty: bounds
-Models of python-control are no longer quantified by a function of their own; use kros.quantify, which takes systems and
-response data, with from_control for transfer functions and uncertainty_to_control for the result.
-    kros.interop: quantify_models
+Models of python-control are no longer quantified by functions of their own; use kros.quantify, which takes systems and
+response data, with from_control for transfer functions, and to_control for the nominal and the weights of the result.
+    kros.interop: quantify_models UncertaintyForControl uncertainty_to_control
 Variation and noise are no longer an object; use the noise_share of a run, under uncertainty in metrics.json.
     kros.uncertainty: VariationAndNoise variation_and_noise
 The numerical error of generated code is no longer an object; kros export c prints it.

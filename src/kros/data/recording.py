@@ -358,7 +358,6 @@ def usable_episodes(population: Population, on_nan: str = "error") -> Iterator[t
     for key in population.episodes:
         try:
             values = population.source(key)
-            check_episode(values, key, population.columns)
         except NonFiniteError as error:
             if on_nan != "drop_episode":
                 raise

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..core.arrays import Array, Whole, frozen
 
+T = TypeVar("T")
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
 
 
@@ -21,16 +23,16 @@ class ErrorSummary:
     spectra: Array  # (batch, n_freqs, n): Welch's power spectral density of the error
     freqs_hz: Array  # (n_freqs,)
 
-    @classmethod
-    def joined(cls, parts: Sequence[ErrorSummary]) -> ErrorSummary:
-        """Return the summary of one batch after the other."""
-        names = ("rms", "percent", "spectra")
-        return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-
     def band_power(self, band_hz: tuple[float, float]) -> Array:
         """Return the error's power inside a band, shape (batch, n)."""
         inside = (self.freqs_hz >= band_hz[0]) & (self.freqs_hz <= band_hz[1])
         return self.spectra[:, inside].sum(axis=1) * (self.freqs_hz[1] - self.freqs_hz[0])
+
+
+def joined(parts: Sequence[T], *names: str) -> T:
+    """Return errors of one batch after the other, with some fields for all of them."""
+    changed: Any = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[0], **changed)  # type: ignore[type-var]
 
 
 def summarise(estimates: Array, truth: Array, lengths: Whole, dt: float) -> list[ErrorSummary]:

@@ -15,7 +15,7 @@ from ..identify import ModelSet, free_run
 from ..observer import Observer
 from ..observer.sensor import Sensors
 from ..observer.simulate import run_observers
-from .errors import ErrorSummary, summarise
+from .errors import ErrorSummary, joined, summarise
 from .sensor import as_shown
 from .truth import TrueErrors, true_errors
 
@@ -57,8 +57,9 @@ class Outcome:
     def joined(cls, parts: Sequence[Outcome], order: Sequence[int]) -> Outcome:
         """Join outcomes of episodes; `order` is that in which pieces are displayed."""
         pieces, true = [piece for part in parts for piece in part.shown], [p.true for p in parts if p.true is not None]
-        summary = ErrorSummary.joined([part.summary for part in parts])
-        return cls(summary, [pieces[i] for i in order], TrueErrors.joined(true) if true else None)
+        summary = joined([part.summary for part in parts], "rms", "percent", "spectra")
+        shown = [pieces[i] for i in order]
+        return cls(summary, shown, joined(true, "rms", "error_percent", "lag_s") if true else None)
 
 
 @frozen

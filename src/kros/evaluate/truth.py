@@ -7,8 +7,6 @@ show it; error and lag against the truth do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ..core.arrays import Array, Whole, frozen
@@ -23,12 +21,6 @@ class TrueErrors:
     rms: Array  # (batch, n_truths)
     error_percent: Array  # (batch, n_truths): as that of `ErrorSummary`
     lag_s: Array  # (batch, n_truths), s: how late the signal is, see `delay_samples`; NaN where that is unknown
-
-    @classmethod
-    def joined(cls, parts: Sequence[TrueErrors]) -> TrueErrors:
-        """Return the errors of one batch after the other."""
-        names = ("rms", "error_percent", "lag_s")
-        return cls(parts[0].states, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def true_errors(signals: Array, truths: Array, states: tuple[int, ...], lengths: Whole, dt: float) -> TrueErrors:

@@ -16,18 +16,16 @@ from typing import TYPE_CHECKING
 from ..core.removed import lazy_names
 
 if TYPE_CHECKING:
-    from .control import UncertaintyForControl, from_control, to_control, uncertainty_to_control
+    from .control import from_control, to_control
     from .pykoop import from_pykoop, to_pykoop
     from .sklearn_estimator import KoopmanRegressor
 
 __all__ = [
     "KoopmanRegressor",
-    "UncertaintyForControl",
     "from_control",
     "from_pykoop",
     "to_control",
     "to_pykoop",
-    "uncertainty_to_control",
 ]
 
 _HOME = dict.fromkeys(__all__, "control") | {"KoopmanRegressor": "sklearn_estimator"}

@@ -1,4 +1,4 @@
-"""Systems to and from python-control, with the names of their signals, and how models of it differ.
+"""Systems to and from python-control, with the names of their signals.
 
 kros.core.StateSpace (a batch) ── to_control ──► control.StateSpace (a list) ── from_control ──► kros.core.StateSpace
 """
@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import frozen
 from ..core.errors import DataError, DimensionError, MissingDependencyError
 from ..core.lti import StateSpace
-from ..uncertainty import ResponseUncertainty, UncertainModel
 
 try:
     import control
@@ -21,46 +19,6 @@ except ImportError as error:
     raise MissingDependencyError(
         "kros.interop.control needs python-control, which is not installed; install it (pip install 'kros[control]')."
     ) from error
-
-
-@frozen
-class UncertaintyForControl:
-    """A nominal and weights: models have ``E = left Delta right``, ``||Delta|| <= 1`` in the form.
-
-    Parameters
-    ----------
-    nominal : control.StateSpace or control.FRD
-        In physical units; response data where the models were.
-    scaled_nominal : control.StateSpace or control.FRD
-        Between scaled inputs and outputs, where the weights act.
-    left, right : control.StateSpace
-        Stable and minimum phase, in the time of the models.
-    remainder_left, remainder_right : control.StateSpace or None
-        Weights of an additive part that joins the set where the form does not reach every model.
-    model : UncertainModel or ResponseUncertainty
-        Bounds of all forms, cover, misfit, names.
-    certificate : str
-        Where the bound is known to hold.
-
-    Examples
-    --------
-    >>> import control
-    >>> import kros
-    >>> from kros.interop import uncertainty_to_control
-    >>> lags = [control.ss([[pole]], [[1 - pole]], [[1]], [[0]], 0.01) for pole in (0.88, 0.9, 0.91)]
-    >>> found = uncertainty_to_control(kros.quantify(lags, "additive"))
-    >>> found.model.nominal_id, found.nominal.ninputs, found.left.dt
-    ('1', 1, 0.01)
-    """
-
-    nominal: Any
-    scaled_nominal: Any
-    left: Any
-    right: Any
-    remainder_left: Any
-    remainder_right: Any
-    model: UncertainModel | ResponseUncertainty
-    certificate: str
 
 
 def to_control(
@@ -166,43 +124,6 @@ def _realised(model: Any) -> Any:
             raise DataError(f"from_control: {problem}; give a causal model.") from error
         total = total + rows[:, [i]] * entry * columns[[j]]
     return total
-
-
-def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> UncertaintyForControl:
-    """Return nominal and weights as `control.StateSpace`, a nominal response as `control.FRD`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.core import StateSpace
-    >>> from kros.interop import uncertainty_to_control
-    >>> from kros.uncertainty import quantify
-    >>> poles = np.array([0.88, 0.9, 0.91])[:, None, None]
-    >>> units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> uncertainty_to_control(quantify(units, "additive")).nominal.dt
-    0.01
-    """
-    if isinstance(model, UncertainModel):
-        nominal = to_control(model.nominal_system, name="nominal")
-        scaled = to_control(model.scaled_nominal(), name="scaled_nominal")
-        certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
-    else:
-        G, certificate = model.nominal_response, model.certificate
-        nominal, scaled = (
-            control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, model.sample_period_s)
-            for g in (G, G / model.output_scale[:, None] * model.input_scale)
-        )
-    extra = model.remainder
-    return UncertaintyForControl(
-        nominal=nominal,
-        scaled_nominal=scaled,
-        left=to_control(model.weight.left, name="weight_left"),
-        right=to_control(model.weight.right, name="weight_right"),
-        remainder_left=None if extra is None else to_control(extra.left, name="remainder_left"),
-        remainder_right=None if extra is None else to_control(extra.right, name="remainder_right"),
-        model=model,
-        certificate=certificate,
-    )
 
 
 def _label(name: str) -> str:

@@ -7,22 +7,20 @@ warning: everything below is checked either way.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, Field, create_model
+from pydantic import AfterValidator, ConfigDict, Field, create_model
 
-from ..core.arrays import Array
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
 from ..core.errors import DataError, KrosError
 from ..core.files import shortened
 from ..core.lti import StateSpace
 from ..core.settings import Settings
 from ..lifting import Lifting
-from ..synthesis.result import Injection
 from .data import ObserverData
 from .filter_bank import FilterBank
 from .monitor import Monitor
@@ -36,7 +34,16 @@ SCHEMA, KIND = 3, "observer"
 _PERHAPS = ("lifting_inputs", "input_functions", "sizes", "sensor", "about")  # absent where they are empty
 Name = Annotated[str, Field(min_length=1)]
 Row = list[float]
-Matrix = list[Row]
+
+
+def _even(rows: list[Row]) -> list[Row]:
+    """Refuse a matrix with rows of different lengths."""
+    if len(lengths := {len(row) for row in rows}) > 1:
+        raise ValueError(f"all rows should have the same length, found {sorted(lengths)}")
+    return rows
+
+
+Matrix = Annotated[list[Row], AfterValidator(_even)]
 Limits = list[float | None]  # null is infinite
 
 
@@ -179,10 +186,9 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         raise DataError(
             f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {list(measured)}."
         )
-    n, m, q = lifting.n_lifted, len(content["inputs"]) + len(lifting.input_functions), len(measured)
-    order, width = len(content["controller"]["A"]), m if content["injection"] == Injection.INPUT.value else n
-    shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
-    A, B, C, D = (_matrix(content["controller"][key], shape, f"controller.{key}") for key, shape in shapes.items())
+    order, q = len(content["controller"]["A"]), len(measured)
+    rows = [(content["controller"][key], order if key in "AC" else q) for key in "ABCD"]
+    A, B, C, D = (np.reshape(matrix, (len(matrix), width)) for matrix, width in rows)
     given = {key: _given(part) for key, part in _given({key: content[key] for key in _PARTS}).items()}
     for name, end in (("lower", -np.inf), ("upper", np.inf)):
         if name in (runtime := given.get("runtime", {})):
@@ -190,8 +196,8 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
     return ObserverData(
         content["name"],
         lifting,
-        _matrix(content["model"]["A"], (n, n), "model.A"),
-        _matrix(content["model"]["B"], (n, m), "model.B"),
+        np.array(content["model"]["A"]),
+        np.array(content["model"]["B"]),
         measured,
         tuple(content["inputs"]),
         StateSpace(A, B, C, D, content["sample_period_s"]),
@@ -207,13 +213,3 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
 def _given(fields: Mapping[str, Any]) -> Content:
     """Return the fields that are not null."""
     return {name: value for name, value in fields.items() if value is not None}
-
-
-def _matrix(rows: Matrix, shape: tuple[int, int], where: str) -> Array:
-    """Return a matrix from lists of lists."""
-    lengths: Sequence[int] = sorted({len(row) for row in rows})
-    if len(rows) != shape[0] or lengths not in ([shape[1]], []):
-        raise DataError(
-            f"{where} should have {shape[0]} rows of {shape[1]} numbers, found {len(rows)} rows of {lengths}."
-        )
-    return np.array(rows, dtype=float).reshape(shape)

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -94,6 +95,8 @@ def like_measurement_noise(covariance: Array, R: Array) -> float:
 
 def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], segment: int = SEGMENT) -> Array:
     """Return every unit's cross spectral density of the residual by Welch's method, means included."""
+    from scipy.signal import csd
+
     lengths = np.asarray(lengths, dtype=int)
     size = int(min(segment, lengths.min(), len(residual)))
     if size < FEWEST_SAMPLES:
@@ -102,23 +105,18 @@ def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], 
             f"{FEWEST_SAMPLES} are needed; leave short episodes out."
         )
     size -= size % 2
-    hann = np.sin(np.pi * np.arange(size) / size) ** 2
-    hann /= np.sqrt(size * np.mean(hann**2))
-    n = residual.shape[2]
-    total = np.zeros((residual.shape[1], size // 2 + 1, n, n), complex)
-    counts = np.zeros(residual.shape[1])
-    for start in range(0, len(residual) - size + 1, size // 2):
-        inside = np.flatnonzero(start + size <= lengths)
-        response = np.moveaxis(np.fft.rfft(residual[start : start + size, inside] * hann[:, None, None], axis=0), 0, 1)
-        total[inside] += response[..., :, None] * response[..., None, :].conj()
-        counts[inside] += 1
+    x = [residual[:length, i].T for i, length in enumerate(lengths.tolist())]
+    options: dict[str, Any] = {"nperseg": size, "detrend": False, "return_onesided": False}
+    total = np.moveaxis(
+        np.array([csd(one[None], one[:, None], **options)[1][..., : size // 2 + 1] for one in x]), -1, 1
+    )
     if not np.isfinite(total).all():
         raise DataError(
             "Residual spectra: the residual contains NaN or infinity; look at the recordings and the nominal model."
         )
-    names = list(dict.fromkeys(units))
-    member = np.array([[u == name for u in units] for name in names], dtype=float)
-    return np.einsum("ub,bfij->ufij", member / (member @ counts)[:, None], total)
+    member = np.array([[u == name for u in units] for name in dict.fromkeys(units)])
+    counts = member * (lengths // (size // 2) - 1)  # segments
+    return np.einsum("ub,bfij->ufij", counts / counts.sum(axis=1, keepdims=True), total)
 
 
 @frozen

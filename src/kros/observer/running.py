@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import UserDict
-from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core.arrays import AnyArray, Array, ArrayLike
-from ..core.errors import ConfigError, DimensionError
+from ..core.errors import DimensionError
 from .data import ObserverData
 from .monitor import Watch
 from .screen import LONGEST, Held, SampleStatus, Screen, Screened
@@ -64,7 +63,7 @@ class RunningObserver:
     y : ndarray, shape (q,)
         First measurement.
     parameters : mapping of str to float
-        The machine's own lifting parameters; they may be changed between steps.
+        The machine's own lifting parameters; others may be assigned between steps.
 
     Examples
     --------
@@ -91,15 +90,14 @@ class RunningObserver:
         return self.observer.lifting.states
 
     @property
-    def parameters(self) -> MutableMapping[str, float]:
+    def parameters(self) -> Mapping[str, float]:
         """The machine's lifting parameters; an unknown name, or a value that is not finite, is refused."""
-        return self._parameters
+        return dict(self._course.values)
 
     @parameters.setter
     def parameters(self, values: Mapping[str, float]) -> None:
-        """Change all of them."""
-        self._parameters = _Checked(self.observer, values)
-        self._course.values = self._course.steps.values = self._parameters.data
+        """Change all of them; the nominal unit's stand for others."""
+        self._course.values = self._course.steps.values = self.observer.values(values, ())
 
     def track(self, name: str, settle_s: float | None = None) -> None:
         """Let one of the parameters follow the machine from now on (`PhaseLockedLoop`).
@@ -176,7 +174,7 @@ class RunningObserver:
         self._fresh = False
         run = stepped(course, sample)
         if course.loop is not None:
-            self.parameters[course.loop.name] = float(course.values[course.loop.name][0])
+            course.values[course.loop.name] = course.values[course.loop.name][0]
         if watch is not None:
             watch.take(run.innovation[0, 0], sample.status[0, 0] != 0, run.starts[0, 0], run.moving[0, 0])
         self._status = SampleStatus(int(sample.status[0, 0] | run.status[0, 0]))
@@ -207,19 +205,3 @@ class RunningObserver:
         if len(ahead):
             x = forward(self.observer, steps.values, np.array([len(ahead)]), x, steps.earlier(ahead[0]), ahead)
         return Estimate(self._places, self.observer.runtime.clip_estimate(x[0].copy()))
-
-
-class _Checked(UserDict[str, float]):
-    """Parameters of one machine; what the lifting does not know, or cannot use, does not get in."""
-
-    def __init__(self, observer: ObserverData, values: Mapping[str, float]) -> None:
-        super().__init__()
-        self._observer, self.data = observer, observer.values(values, ())
-
-    def __setitem__(self, name: str, value: float) -> None:
-        self.data.update(self._observer.values({**self.data, name: value}, ()))
-
-    def __delitem__(self, name: str) -> None:
-        raise ConfigError(
-            f"Running observer {self._observer.name}: the parameter {name!r} cannot be taken away; change its value."
-        )

@@ -9,19 +9,16 @@ import time
 from collections.abc import Iterator
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import unquote
 
 from ..core.errors import ConfigError
 from ..core.files import write_bytes
 from ..core.work import Progress
-from .canvas import settle
+from .canvas import Figure, settle
 from .figures import FIGURES, draw_all
 from .run_folder import RunFolder
 from .theme import DRAWING, Tone, style
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 

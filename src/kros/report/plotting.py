@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from importlib import import_module
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..core.errors import ConfigError
+from .canvas import Figure
 from .theme import style
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _ESTIMATES = {"estimates": "episodes:design_figure"}
 PLOTS: dict[str, dict[str, str]] = {

@@ -40,17 +40,13 @@ def errors(facts: Facts) -> Section | None:
 
 
 def other_conditions(facts: Facts) -> Section | None:
-    """Return errors in conditions that no model has seen; None where there is one condition."""
+    """Return what the estimates are like in conditions that no model has seen; None where there is one condition."""
     if len(facts.tables) < 2:
         return None
-    text = f"Models, weights and observers are designed in “{condition_label(facts.study['identify_on'])}” alone."
-    shown = []
-    for table in facts.tables[1:]:
-        rows = [(table, name) for name in _compared(facts) if name in table.cells]
-        about = [Column("observer", [observer_label(name) for _, name in rows])]
-        shown.append(_table(f"Errors{in_condition(table.condition)}", about, rows, facts))
+    designed = f"Models, weights and observers are designed in “{condition_label(facts.study['identify_on'])}” alone"
     figure = "load_torque" if facts.get("load_torque") else "loaded_paper"
-    return Section("other-conditions", "Other conditions", [text], tables=shown, figure=figure)
+    text = f"{designed}; their errors in all conditions are in the table of all observers."
+    return Section("other-conditions", "Other conditions", [text], figure=figure)
 
 
 def left_out(facts: Facts) -> Section | None:

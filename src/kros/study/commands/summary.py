@@ -13,6 +13,7 @@ from ...core.artifacts import load_artifact
 from ...core.errors import ConfigError
 from ...core.files import write_bytes
 from ...report.compare import comparison, lines, sections
+from ...report.content import Column, Section, build
 from ...report.error_tables import ErrorCell
 from ...report.facts import Facts
 from ...report.html import filled
@@ -33,11 +34,11 @@ _OPTIONAL = {
 def diagnose() -> list[str]:
     """Return lines for people."""
     system = f"Python {platform.python_version()} on {platform.platform(terse=True)}"
-    lines = [f"kros {_version('kros', 'not installed as a package')}   {system}"]
-    lines += [f"  {name:<16} {_version(name, 'MISSING: install kros again')}" for name in _REQUIRED]
-    lines += ["optional", *(f"  {name:<16} {_version(name, 'not installed')}   {of}" for name, of in _OPTIONAL.items())]
+    rows = [f"kros {_version('kros', 'not installed as a package')}   {system}"]
+    rows += [f"  {name:<16} {_version(name, 'MISSING: install kros again')}" for name in _REQUIRED]
+    rows += ["optional", *(f"  {name:<16} {_version(name, 'not installed')}   {of}" for name, of in _OPTIONAL.items())]
     compiler = shutil.which("cc") or shutil.which("gcc") or "none"
-    return [*lines, f"C compiler        {compiler}   for checking exported C code"]
+    return [*rows, f"C compiler        {compiler}   for checking exported C code"]
 
 
 def _version(name: str, otherwise: str) -> str:
@@ -53,19 +54,13 @@ def ranking(facts: Facts) -> list[str]:
     if table is None:
         return []
     hidden = table.hidden(facts.measured)
-    rows = [("", list(hidden), "")]
-    for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
-        mark = "  <- deployed" if name == facts.deployed else ""
-        rows.append((name, [_error(table.cells[name].get(channel)) for channel in hidden], mark))
-    width, wide = max(len(name) for name, _, _ in rows), max(12, *(len(c) + 2 for c in hidden))
-    lines = [f"{name:<{width}}  " + "".join(f"{t:>{wide}}" for t in texts) + mark for name, texts, mark in rows]
-    return ["observers by mean error on held-out episodes, percent of the largest value:", *lines]
-
-
-def _error(cell: ErrorCell | None) -> str:
-    if cell is None:
-        return "–"
-    return "diverged" if cell.mean is None else f"{cell.mean:.4g}"
+    names = sorted(table.cells, key=lambda name: table.mean(name, hidden))
+    columns = [Column("", [f"{name}{'  <- deployed' if name == facts.deployed else ''}" for name in names])]
+    for channel in hidden:
+        cells = [table.cells[name].get(channel, ErrorCell()) for name in names]
+        columns.append(Column(channel, ["diverged" if cell.diverged else cell.mean for cell in cells]))
+    title = "observers by mean error on held-out episodes, percent of the largest value:"
+    return lines(Section("", title, tables=[build("", columns)]))[1:]
 
 
 def list_run(run: Path) -> list[str]:

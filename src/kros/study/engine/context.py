@@ -7,16 +7,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...core.artifacts import digest_of, load_artifact, write_json
+from ...core.files import stamp_of
 from ...core.work import Results, Work
 from ...data.population import EpisodeKey, Population
 from ...data.recording import NonFiniteError
+from ...data.recording import digest_of as episode_digest
 from ...identify import PhaseCalibration, PhaseSpec
 from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
@@ -161,12 +160,12 @@ def inputs_digest(context: Context) -> str:
         declared = (given.columns, given.sample_period_s, given.units, sorted(given.metadata.items()))
         return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
     files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [Path(source)]
-    return digest_of([(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files])
+    return digest_of([(str(f), *stamp_of(f)) for f in files])
 
 
 def _digest(given: Population, key: EpisodeKey) -> str:
     """Return a digest of an episode; of one that is not finite, the message: it is dropped, or an error."""
     try:
-        return sha256(np.ascontiguousarray(given.source(key)).tobytes()).hexdigest()
+        return episode_digest(given.source(key))
     except NonFiniteError as error:
         return str(error)

@@ -108,8 +108,8 @@ def drives() -> SimpleNamespace:
 def test_loads_of_units_that_took_no_part_are_found(drives: SimpleNamespace) -> None:
     """Slow errors under load stay near the floor without, with the level and for the seen part."""
     accuracy = load_accuracy(drives.leveled.load, drives.others.load, DT, skip=2000)
-    assert accuracy.ratio < 1.7  # 1.62: of a floor of 0.019 A; where parts counted alike, 1.37 of 0.026 A
-    assert accuracy.percent < 25
+    assert accuracy.ratio < 1.5
+    assert accuracy.percent < 35
     seen = load_accuracy(drives.estimate[..., 3], without_level(drives.others.load, 10.0, DT), DT)
     assert seen.ratio < 1.5
 

@@ -114,7 +114,7 @@ def unit_of_factor(factor: float, unit: str) -> str:
 
 
 def split_header(text: str) -> tuple[str, str]:
-    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A``, ``v_m/s`` or ``time_ms``."""
+    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A`` or ``v_m/s``."""
     text = text.strip()
     bracketed, after = _BRACKETED.match(text), _AFTER.match(text)
     if bracketed and bracketed[1]:

@@ -57,7 +57,7 @@ class Recording:
         return replace(self, values=self.values[start:stop], time_s=time)
 
     def distinct(self) -> Recording:
-        """Return the same without samples that repeat the time and all values of those before, as late loggers write."""
+        """Return the same without samples that repeat time and all values of those before, as late loggers write."""
         if self.time_s is None:
             return self
         again = 1 + np.flatnonzero(np.diff(self.time_s) == 0)

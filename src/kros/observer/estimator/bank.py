@@ -71,7 +71,7 @@ class Bank:
         return np.hstack([*parts, np.ones((len(at), 1))])
 
     def sizes(self, rms: Array) -> Array:
-        """Return the sizes of entries, their RMS; for the start of its decay by the channel's: machines start at rest."""
+        """Return the sizes of entries, their RMS; for the start of its decay by the channel's: many start at rest."""
         size, first, moving = rms.copy(), self._first, self.channels - 1
         size[first] = np.outer(rms[first][moving :: self.channels], [*rms[:moving], 1.0]).ravel()
         return np.maximum(size, ITERATED * size.max())

@@ -417,4 +417,4 @@ def condition_weights(moments: Moments) -> Array:
     alike = conditions[:, None] == conditions
     (first,) = moments.solved(moments.rows, [(ROUNDING, 1.0)])
     errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
-    return moments.rows * alike.sum(axis=1) / (alike @ errors)
+    return moments.rows / (alike @ moments.rows) * alike.sum(axis=1) ** 2 / (alike @ errors)

@@ -227,7 +227,7 @@ def _examined(
 ) -> Discovery:
     """Look at every episode, leave out what cannot be used, and complete the description."""
     population, mapping, notes = draft.population, draft.mapping, dict(draft.notes)
-    looks = examine(population, work)
+    looks = examine(population, work or Work())
     wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
     nan, counts = [s.nan for s in good if s.nan], Counter((s.key.unit, s.key.condition) for s in good if not s.nan)
     if not counts:

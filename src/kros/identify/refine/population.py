@@ -254,7 +254,7 @@ def free_run_errors(
         values = {name: given[part] for name, given in parameters.items()}
         x, u = (np.ascontiguousarray(np.swapaxes(signal, 0, 1)) for signal in (batch.states, batch.inputs))
         runs = free_run(models.A[part], models.B[part], lifting, values, x[:, : lifting.history + 1], u)
-        inside = (np.arange(x.shape[1]) < batch.lengths[:, None])[..., None]
+        inside = batch.inside.T[..., None]
         with np.errstate(over="ignore", invalid="ignore"):
             squares = np.where(inside, (runs - x) ** 2, 0.0).sum(axis=1) / batch.lengths[:, None]
             errors.append((np.sqrt(squares), np.where(inside, np.abs(runs), 0.0).max(axis=1)))

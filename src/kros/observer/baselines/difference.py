@@ -33,7 +33,7 @@ class FilteredDifference:
 
     def scaled_to(self, batch: EpisodeBatch, measured: Sequence[int]) -> FilteredDifference:
         """Return the same with the scales that fit recordings best, so that units of measure do not matter."""
-        y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
+        y, inside = batch.measurements(measured, arrived=False), batch.inside
         found, states = rates(y, self.cutoff_hz, self.sample_period_s)[inside], batch.states[inside]
         both = [(found[:, i], states[:, j]) for i, j in self.pairs]
         return replace(self, scales=tuple(float(r @ x / (r @ r)) if r.any() else 1.0 for r, x in both))
@@ -50,7 +50,7 @@ def rates(y: Array, cutoff_hz: float, sample_period_s: float) -> Array:
 
 def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:
     """Return which states are rates of measured ones: these explain a share of their variance, whatever the units."""
-    y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
+    y, inside = batch.measurements(measured, arrived=False), batch.inside
     states, dt = batch.states[inside].T, batch.sample_period_s
     share = np.zeros((len(measured), len(states)))
     for cutoff in cutoffs_hz(dt)[::4]:

@@ -41,7 +41,7 @@ _BLOCK = 20_000  # samples of an episode that are run at once
 _BATCH = 20  # shorter episodes that run side by side
 
 
-def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
+def open_data(config: StudyConfig, data: Path, optional: Collection[str]) -> Population:
     """Open a folder with the run's reader, or what a TOML with ``[data]`` names; `optional` channels may be absent."""
     section = config.data
     if data.is_file():

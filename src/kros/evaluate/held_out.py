@@ -35,12 +35,12 @@ def observers_run(observers: Sequence[Observer]) -> Run:
     return run
 
 
-def alike(observers: Iterable[Observer], together: int = 8) -> list[list[Observer]]:
+def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
     """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
     groups: dict[Any, list[Observer]] = {}
     for o in observers:
         groups.setdefault((o.lifting, tuple(o.parameters.items()), o.measured, o.inputs), []).append(o)
-    return [g[start : start + together] for g in groups.values() for start in range(0, len(g), together)]
+    return [g[start : start + 8] for g in groups.values() for start in range(0, len(g), 8)]
 
 
 @frozen

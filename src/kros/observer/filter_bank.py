@@ -62,9 +62,9 @@ class Gaps:
     """State of the gaps of filter banks over a batch of machines."""
 
     def __init__(self, bank: FilterBank, A: Array, measured: tuple[int, ...], recorded: int, batch: int) -> None:
-        n, q, first = len(A), len(measured), recorded
+        n, q = len(A), len(measured)
         self.bank, self.measured, self.recorded = bank, list(measured), recorded
-        self.filters = slice(first, first + bank.filters)
+        self.filters = slice(recorded, recorded + bank.filters)
         self.fallback = slice(n - recorded, n)
         self._A, self._B = A[self.filters, self.filters], A[self.filters, :][:, self.measured]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)

@@ -103,10 +103,10 @@ class Monitor:
         return (levels * self.weights).sum(axis=(-2, -1)) / WEIGHT
 
 
-def octaves(count: int = 6, quality: float = 1.4) -> Array:
+def octaves(count: int = 6) -> Array:
     """Return band-pass filters of order two, (count, 3), an octave apart, from half the Nyquist frequency down."""
     w = 2 * np.pi * 0.256 / 2.0 ** np.arange(count)
-    alpha = np.sin(w) / (2 * quality)
+    alpha = np.sin(w) / 2.8  # of quality 1.4
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
 
 

@@ -70,7 +70,8 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
     """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
     samples = screened(observers[0], y, u)
     courses = [Course(observer, samples.starts.shape[1], parameters) for observer in observers]
-    return np.stack([run.estimates for run in _run(courses, samples)])
+    first, *others = [run.estimates[None] for run in _run(courses, samples)]
+    return np.concatenate([first, *others]) if others else first  # one may be large: it is not copied
 
 
 def run_innovations(
@@ -84,10 +85,9 @@ def run_innovations(
 
 def _run(courses: Sequence[Course], samples: Screened) -> list[Stepped]:
     """Run observers of one model on: compiled where they go on side by side within their bounds, else in NumPy."""
-    loops, runs = library(), list[Stepped | None]([None] * len(courses))
-    alone = len(courses) == 1 or courses[0].steps.gaps is None
-    if loops is not None and alone and all(course.even(samples) for course in courses):
-        runs = _compiled(loops, courses, samples)
+    loops, alone = library(), len(courses) == 1 or courses[0].steps.gaps is None
+    even = alone and all(course.even(samples) for course in courses)
+    runs = [None] * len(courses) if loops is None or not even else _compiled(loops, courses, samples)
     finished = [run or stepped(course, samples) for run, course in zip(runs, courses, strict=True)]
     for run, course in zip(finished, courses, strict=True):
         course.observer.runtime.clip_estimate(run.estimates, out=run.estimates)

@@ -120,6 +120,7 @@ class SetRule:
     resolved: float = 10 ** (3 / 20)  # fall of a bound beside a peak beyond which frequencies do not resolve it
     entry_order: int = 3  # of fits to single entries, which are shown and decide nothing
     singular: float = 1e10  # condition beyond which the paper's weights have no inverse
+    retained: int = 500_000  # units times frequencies, at most, whose residuals are not computed for every proof again
     at_once: int = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
 
 

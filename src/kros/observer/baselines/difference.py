@@ -48,8 +48,8 @@ def rates(y: Array, cutoff_hz: float, sample_period_s: float) -> Array:
     return lfilter(*butter(2, cutoff_hz, fs=1 / sample_period_s), rate, axis=0)
 
 
-def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:
-    """Return which states are rates of measured ones: these explain a share of their variance, whatever the units."""
+def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, int], ...]:
+    """Return which states are rates of measured ones: these explain half of their variance, whatever the units."""
     y, inside = batch.measurements(measured, arrived=False), batch.inside
     states, dt = batch.states[inside].T, batch.sample_period_s
     share = np.zeros((len(measured), len(states)))
@@ -57,7 +57,7 @@ def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.
         pairs = product(rates(y, cutoff, dt)[inside].T, states)
         share = np.maximum(share, np.reshape([_explained(*pair) for pair in pairs], share.shape))
     share[:, list(measured)] = 0.0
-    best = [(i, int(j)) for i, j in enumerate(share.argmax(axis=1)) if share[i, j] > explained]
+    best = [(i, int(j)) for i, j in enumerate(share.argmax(axis=1)) if share[i, j] > 0.5]
     return tuple((i, j) for i, j in best if share[:, j].argmax() == i)
 
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Whole
+from ...core.arrays import Array, Flags
 from ...core.errors import IdentificationError
 from ...core.linalg import qr_triangle, radius_text
 from ...core.rounding import EPS, TINY
@@ -27,7 +27,7 @@ from ..factors import Factor, Ranges
 from ..free_run import free_run
 from .metric import ResponsePrior, peak_residual
 from .problem import OneStep, RefinementProblem, stability_barrier
-from .search import Evaluate, GaussNewton, RefineOptions, Solution
+from .search import GaussNewton, RefineOptions, Solution
 from .segments import Segments, TrainingData, held_segments, read_segments
 
 log = logging.getLogger(__name__)
@@ -137,11 +137,7 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
 
 def _fit(problem: RefinementProblem, V: Array, search: GaussNewton) -> Solution:
     """Fit every unit by itself; those that are done are not run on."""
-
-    def narrowed(rows: Whole) -> Evaluate:
-        return problem.of_units(rows).evaluate
-
-    return search.minimise(problem.evaluate, problem.admissible, V, narrowed)
+    return search.minimise(problem.evaluate, problem.admissible, V, lambda rows: problem.of_units(rows).evaluate)
 
 
 def _choose(scores: Array, peaks: Array, options: RefineOptions) -> int:

@@ -20,7 +20,7 @@ from .sensor import as_shown
 from .truth import TrueErrors, true_errors
 
 Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
-SIDE_BY_SIDE = 32  # episodes
+SIDE_BY_SIDE = 16  # episodes
 _NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again
 
 

@@ -177,31 +177,33 @@ static void shifted(const formulas *f, const vec *reg, vec *next)
     for (whole e = 0; e < f->earlier; e++) memcpy(next + e * MOST, reg + f->shift[e] * MOST, MOST * sizeof(vec));
 }
 
-/* to = map column, four rows at a time; a map of every machine's own has vectors in place of numbers. */
-#define PRODUCT(NAME, TYPE, STEP)                                                                                                        \
-    static void NAME(const TYPE *map, whole columns, const vec *const *column, vec *to, whole rows, whole w)                            \
-    {                                                                                                                                    \
-        whole i = 0;                                                                                                                     \
-        for (; i + 4 <= rows; i += 4)                                                                                                    \
-            for (whole v = 0; v < w; v++) {                                                                                              \
-                vec a = {0}, b = {0}, c = {0}, d = {0};                                                                                  \
-                const TYPE *at = map + i * columns * STEP + (STEP > 1 ? v : 0);                                                          \
-                for (whole j = 0; j < columns; j++, at += STEP) {                                                                        \
-                    const vec x = column[j][v];                                                                                          \
-                    a += at[0] * x, b += at[columns * STEP] * x, c += at[2 * columns * STEP] * x, d += at[3 * columns * STEP] * x;       \
-                }                                                                                                                        \
-                to[i * MOST + v] = a, to[(i + 1) * MOST + v] = b, to[(i + 2) * MOST + v] = c, to[(i + 3) * MOST + v] = d;                \
-            }                                                                                                                            \
-        for (; i < rows; i++)                                                                                                            \
-            for (whole v = 0; v < w; v++) {                                                                                              \
-                vec a = {0};                                                                                                             \
-                const TYPE *at = map + i * columns * STEP + (STEP > 1 ? v : 0);                                                          \
-                for (whole j = 0; j < columns; j++, at += STEP) a += at[0] * column[j][v];                                               \
-                to[i * MOST + v] = a;                                                                                                    \
-            }                                                                                                                            \
+/* to = map column, four rows at a time, which have their own columns: those that are zero in all four cost nothing. */
+static void product(const double *map, const whole *counts, const vec *const *column, vec *to, whole rows, whole w)
+{
+    for (whole i = 0; i < rows; i += 4, counts++) {
+        for (whole v = 0; v < w; v++) {
+            vec sums[4] = {{0}, {0}, {0}, {0}};
+            const double *at = map;
+            for (whole j = 0; j < *counts; j++, at += 4) {
+                const vec x = column[j][v];
+                sums[0] += at[0] * x, sums[1] += at[1] * x, sums[2] += at[2] * x, sums[3] += at[3] * x;
+            }
+            for (whole k = 0; k < 4 && i + k < rows; k++) to[(i + k) * MOST + v] = sums[k];
+        }
+        map += 4 * *counts, column += *counts;
     }
-PRODUCT(product, double, 1)
-PRODUCT(product_each, vec, MOST)
+}
+
+/* The same with a map of every machine's own. */
+static void product_each(const vec *map, whole columns, const vec *const *column, vec *to, whole rows, whole w)
+{
+    for (whole i = 0; i < rows; i++)
+        for (whole v = 0; v < w; v++) {
+            vec sum = {0};
+            for (whole j = 0; j < columns; j++) sum += map[(i * columns + j) * MOST + v] * column[j][v];
+            to[i * MOST + v] = sum;
+        }
+}
 
 /* Whether the next states and corrections of all machines are within the bounds. */
 static int within(const relift_job *s, whole o, whole rows, const vec *next, whole lanes)
@@ -290,9 +292,11 @@ int kros_relift(const formulas *f, const relift_job *s)
     vec *bank = vectors(4 * recorded), *gap = vectors(gaps), *held = vectors(q), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;
-    double *map = room(rows * columns * (whole)sizeof(double));
-    const vec **column = room(columns * (whole)sizeof(vec *));
-    int failed = !bank || !gap || !held || !missing || !ramp || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
+    const whole groups = (rows + 3) / 4;
+    double *map = room(4 * groups * columns * (whole)sizeof(double));
+    const vec **column = room(groups * columns * (whole)sizeof(vec *));
+    whole *counts = room(groups * (whole)sizeof(whole));
+    int failed = !counts || !bank || !gap || !held || !missing || !ramp || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
     for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
         const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
         settle(f, reg, first, batch, lanes);
@@ -302,24 +306,24 @@ int kros_relift(const formulas *f, const relift_job *s)
         for (whole i = 0; i < gaps; i++) gather(gap + i * MOST, s->gap + i * batch + first, 1, lanes);
         for (whole o = 0; o < s->observers; o++) {
             double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;
-            whole used = 0;
             for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
             for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
             for (whole e = 0; e < ne; e++) gather(reg + (n + e) * MOST, past + e, ne, lanes);
-            for (whole j = 0; j < columns; j++) { /* columns that are zero, such as those of a shorter correction than another's, cost nothing */
-                const double *from = s->map + o * rows * columns + j;
-                whole there = s->own;
-                for (whole i = 0; i < rows && !there; i++) there = from[i * columns] != 0.0;
-                if (!there) continue;
-                whole k = j;
-                if (k < f->n_lifted) column[used] = reg + f->lifted[k] * MOST;
-                else if ((k -= f->n_lifted) < order) column[used] = c + k * MOST;
-                else if ((k -= order) < f->n_inputs) column[used] = reg + f->lifted[f->n_lifted + k] * MOST;
-                else column[used] = y + (k - f->n_inputs) * MOST;
-                for (whole i = 0; i < rows; i++) map[i * columns + used] = from[i * columns];
-                used++;
+            for (whole i = 0, used = 0, at = 0; i < rows; i += s->own ? rows : 4) {
+                const whole before = used;
+                for (whole j = 0; j < columns; j++) {
+                    const double *from = s->map + (o * rows + i) * columns + j;
+                    whole there = s->own, k = j;
+                    for (whole l = 0; l < 4 && i + l < rows && !there; l++) there = from[l * columns] != 0.0;
+                    if (!there) continue;
+                    if (k < f->n_lifted) column[used++] = reg + f->lifted[k] * MOST;
+                    else if ((k -= f->n_lifted) < order) column[used++] = c + k * MOST;
+                    else if ((k -= order) < f->n_inputs) column[used++] = reg + f->lifted[f->n_lifted + k] * MOST;
+                    else column[used++] = y + (k - f->n_inputs) * MOST;
+                    for (whole l = 0; l < 4 && !s->own; l++) map[at++] = i + l < rows ? from[l * columns] : 0.0;
+                }
+                counts[i / 4] = used - before;
             }
-            for (whole i = 1; i < rows && used < columns && !s->own; i++) memmove(map + i * used, map + i * columns, (size_t)used * sizeof(double));
             for (whole k = 0; k < s->samples; k++) {
                 if (s->states)
                     for (whole i = 0; i < n; i++) scatter(s->states + ((k * s->observers + o) * n + i) * batch + first, reg + i * MOST, 1, lanes);
@@ -336,7 +340,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                 for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
                 evaluate(f, reg, lanes);
                 if (s->own) product_each(each, columns, column, next, rows, w);
-                else product(map, used, column, next, rows, w);
+                else product(map, counts, column, next, rows, w);
                 shifted(f, reg, older);
                 if (recorded) follow(s, bank, gap, reg, next, held, (const mask *)missing, ramp, n, columns, w);
                 if (!within(s, o, rows, next, lanes)) {
@@ -353,7 +357,7 @@ int kros_relift(const formulas *f, const relift_job *s)
         }
         for (whole i = 0; i < gaps; i++) scatter(s->gap + i * batch + first, gap + i * MOST, 1, lanes);
     }
-    free(bank), free(gap), free(held), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column);
+    free(bank), free(gap), free(held), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);
     return failed;
 }
 

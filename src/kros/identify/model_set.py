@@ -136,7 +136,7 @@ class ModelSet(Shown, Storable):
         """Return frequency responses from inputs to lifted states, shape (unit, frequency, n, m), in recorded units."""
         return self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale
 
-    def scaled_responses(self, freqs_hz: ArrayLike, units: Sequence[str] | None) -> AnyArray:
+    def scaled_responses(self, freqs_hz: ArrayLike, units: Sequence[str] | None = None) -> AnyArray:
         """Return the same with every signal divided by its range."""
         return self.normalised().systems(units).frequency_response(freqs_hz)
 

@@ -165,7 +165,7 @@ class Lifting:
         earlier = [columns[..., h - d : end - d, names.index(q)] for q, d in window.delayed]
         return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
 
-    def parameter_values(self, parameters: Parameters | None) -> dict[str, Array]:
+    def parameter_values(self, parameters: Parameters | None = None) -> dict[str, Array]:
         """Return the values of all parameters, refusing to go on where one is missing."""
         given = parameters or {}
         if missing := [name for name in self.parameters if name not in given]:

@@ -42,7 +42,7 @@ class Sensor(Settings):
     jitter_samples: float = Field(0.0, ge=0, description="standard deviation of the moment of measurement, in samples")
     dropout: float = Field(0.0, ge=0, lt=1, description="probability that a sample is lost, independently of others")
 
-    def variance(self, step: float) -> float:
+    def variance(self, step: float = 0.0) -> float:
         """Return the variance of noise, rounding, and jitter of a signal of RMS `step` from sample to sample."""
         return self.noise**2 + (self.resolution or 0.0) ** 2 / 12 + (self.jitter_samples * step) ** 2
 

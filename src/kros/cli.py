@@ -42,14 +42,14 @@ class EdgeGroup(TyperGroup):
 
 
 @contextlib.contextmanager
-def edge(ctx: Any = None) -> Iterator[None]:
+def edge(ctx: Any) -> Iterator[None]:
     """Turn any exception into one message on standard error and an exit code; `ctx` knows which command it is."""
     try:
         with _stoppable():
             yield
     except KeyboardInterrupt as stopped:
         number = signal.Signals(stopped.args[0] if stopped.args else signal.SIGINT)
-        resumes = ctx is None or ctx.invoked_subcommand in (None, "run", "demo")
+        resumes = ctx.invoked_subcommand in (None, "run", "demo")
         again = "the same command goes on where this one ended." if resumes else "nothing half done is left; run again."
         typer.echo(f"kros: stopped by {number.name if stopped.args else 'Ctrl-C'}; {again}", err=True)
         raise typer.Exit(SIGNALLED + number) from stopped

@@ -96,6 +96,11 @@ class EpisodeBatch:
         """The unit of every episode."""
         return tuple(k.unit for k in self.keys)
 
+    @property
+    def inside(self) -> Flags:
+        """Which samples were recorded, and are not held, shape (n_samples, batch)."""
+        return np.arange(len(self.states))[:, None] < self.lengths
+
     def measurements(self, measured: Sequence[int], arrived: bool = True) -> Array:
         """Return what the sensor shows of some states, (n_samples, batch, q), NaN where a sample has not `arrived`."""
         at = list(measured)

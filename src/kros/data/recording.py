@@ -189,12 +189,10 @@ def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *
         pass
 
 
-def checked_blocks(
-    blocks: Iterable[Array], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False
-) -> Iterator[Array]:
+def checked_blocks(parts: Iterable[Array], key: EpisodeKey, channels: Sequence[Channel], gaps: bool) -> Iterator[Array]:
     """Give the blocks of one episode, none of them empty, on, and check them as `check_episode` does."""
     count, first, resting = 0, np.empty(0), np.ones(len(channels), dtype=bool)
-    for values in blocks:
+    for values in parts:
         if values.ndim != 2 or values.shape[1] != len(channels):
             declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
             raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
@@ -225,7 +223,7 @@ def is_constant(column: Array, first: float | None = None) -> bool:
     return bool(lower <= column[len(column) // 2] <= upper and np.all((column >= lower) & (column <= upper)))
 
 
-def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int = 0) -> None:
+def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int) -> None:
     """Raise NonFiniteError where a channel holds NaN, infinity or what is as good as that."""
     for channel, signal in zip(channels, values.T, strict=True):
         kinds = {

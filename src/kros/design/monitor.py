@@ -103,7 +103,7 @@ def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judg
     return [(values, good) for values, good in episodes if good.any()]
 
 
-def bound_of_peaks(peaks: Sequence[Sequence[float]], settings: MonitorSettings = DEFAULT) -> float:
+def bound_of_peaks(peaks: Sequence[Sequence[float]], settings: MonitorSettings) -> float:
     r"""Return what the highest level of one more unit, on as many other motions, exceeds with the stated rate, dB."""
     from scipy.special import stdtrit
 
@@ -119,7 +119,7 @@ def bound_of_peaks(peaks: Sequence[Sequence[float]], settings: MonitorSettings =
     return mean + float(np.sqrt((bound - mean) ** 2 + wider * np.mean(np.square(apart))))
 
 
-def steady(largest: Mapping[Group, Array], settings: MonitorSettings = DEFAULT) -> Array:
+def steady(largest: Mapping[Group, Array], settings: MonitorSettings) -> Array:
     """Return weights of levels, shape (q, bands), whose mean differs least from unit to unit of a condition."""
     from scipy.optimize import nnls
 

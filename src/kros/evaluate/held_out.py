@@ -20,7 +20,7 @@ from .sensor import as_shown
 from .truth import TrueErrors, true_errors
 
 Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
-SIDE_BY_SIDE = 32  # episodes
+SIDE_BY_SIDE = 16  # episodes
 _NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again
 
 
@@ -35,12 +35,12 @@ def observers_run(observers: Sequence[Observer]) -> Run:
     return run
 
 
-def alike(observers: Iterable[Observer], together: int = 8) -> list[list[Observer]]:
+def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
     """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
     groups: dict[Any, list[Observer]] = {}
     for o in observers:
         groups.setdefault((o.lifting, tuple(o.parameters.items()), o.measured, o.inputs), []).append(o)
-    return [g[start : start + together] for g in groups.values() for start in range(0, len(g), together)]
+    return [g[start : start + 8] for g in groups.values() for start in range(0, len(g), 8)]
 
 
 @frozen

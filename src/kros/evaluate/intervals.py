@@ -53,10 +53,10 @@ def unit_interval(values: ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[
     return result.confidence_interval.low, result.confidence_interval.high
 
 
-def interval_rows(rows: Sequence[Row], role: str = "off_nominal") -> list[dict[str, Any]]:
+def interval_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the 95 % ``interval`` of the mean error over at least three units, by observer, condition and channel."""
     errors: dict[tuple[str, ...], dict[str, Any]] = {}
-    for row in (row for row in rows if row["role"] == role):
+    for row in (row for row in rows if row["role"] == "off_nominal"):
         errors.setdefault(tuple(row[name] for name in _CELL), {})[row["unit"]] = row["error_percent"]
     intervals = []
     for cell, by_unit in errors.items():
@@ -64,5 +64,5 @@ def interval_rows(rows: Sequence[Row], role: str = "off_nominal") -> list[dict[s
         if len(values) > 2 and all(value is not None and np.isfinite(value) for value in values):
             lower, upper = unit_interval(values)
             interval = [float(lower), float(upper)]
-            intervals.append({**dict(zip(_CELL, cell, strict=True)), "role": role, "interval": interval})
+            intervals.append({**dict(zip(_CELL, cell, strict=True)), "role": "off_nominal", "interval": interval})
     return intervals

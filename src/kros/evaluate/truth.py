@@ -32,12 +32,12 @@ def true_errors(signals: Array, truths: Array, states: tuple[int, ...], lengths:
     return TrueErrors(states, error_rms(signals, truths, lengths), error_percent(signals, truths, lengths), lag * dt)
 
 
-def delay_samples(signals: Array, truths: Array, longest: int = 200) -> Array:
-    """Return the delay of truths, at most `longest`, that fits signals best; a parabola refines the least cost."""
+def delay_samples(signals: Array, truths: Array) -> Array:
+    """Return the delay of truths, at most 200 samples, that fits signals best; a parabola refines the least cost."""
     from scipy.signal import fftconvolve
 
     n = len(signals)
-    most = min(longest, n // 4)
+    most = min(200, n // 4)
     if most < 1:
         return np.full(signals.shape[1:], np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -43,7 +43,8 @@ typedef struct {
     whole q;
     whole own;         /* every machine has a map of its own: one observer, map (batch, rows, columns) */
     whole fresh;       /* earlier values equal the present ones at the first sample */
-    whole overwrite;   /* measurements take the place of estimates before these are lifted */
+    whole recorded;    /* first states, whose last ones are the fallback while measurements are missing; none */
+    whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
     const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
     const double *y;          /* (samples, q, batch); none where nothing is measured */
     const double *u;          /* (samples, m, batch) */
@@ -53,6 +54,9 @@ typedef struct {
     uint8_t *left;            /* (observers): whether a machine would leave the bounds; its numbers are then of no use */
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
     double *past;             /* (observers, batch, earlier), moved on */
+    const double *reach;      /* (q) */
+    const double *bank;       /* (4, recorded, batch): forget, half, recovery, longest age */
+    double *gap;              /* (2 recorded + q + q filters, batch): offset, age, count, ramps; moved on */
     double *states;           /* (samples, observers, n, batch): x before every sample; none */
 } relift_job;
 
@@ -173,31 +177,33 @@ static void shifted(const formulas *f, const vec *reg, vec *next)
     for (whole e = 0; e < f->earlier; e++) memcpy(next + e * MOST, reg + f->shift[e] * MOST, MOST * sizeof(vec));
 }
 
-/* to = map column, four rows at a time; a map of every machine's own has vectors in place of numbers. */
-#define PRODUCT(NAME, TYPE, STEP)                                                                                                        \
-    static void NAME(const TYPE *map, whole columns, const vec *const *column, vec *to, whole rows, whole w)                            \
-    {                                                                                                                                    \
-        whole i = 0;                                                                                                                     \
-        for (; i + 4 <= rows; i += 4)                                                                                                    \
-            for (whole v = 0; v < w; v++) {                                                                                              \
-                vec a = {0}, b = {0}, c = {0}, d = {0};                                                                                  \
-                const TYPE *at = map + i * columns * STEP + (STEP > 1 ? v : 0);                                                          \
-                for (whole j = 0; j < columns; j++, at += STEP) {                                                                        \
-                    const vec x = column[j][v];                                                                                          \
-                    a += at[0] * x, b += at[columns * STEP] * x, c += at[2 * columns * STEP] * x, d += at[3 * columns * STEP] * x;       \
-                }                                                                                                                        \
-                to[i * MOST + v] = a, to[(i + 1) * MOST + v] = b, to[(i + 2) * MOST + v] = c, to[(i + 3) * MOST + v] = d;                \
-            }                                                                                                                            \
-        for (; i < rows; i++)                                                                                                            \
-            for (whole v = 0; v < w; v++) {                                                                                              \
-                vec a = {0};                                                                                                             \
-                const TYPE *at = map + i * columns * STEP + (STEP > 1 ? v : 0);                                                          \
-                for (whole j = 0; j < columns; j++, at += STEP) a += at[0] * column[j][v];                                               \
-                to[i * MOST + v] = a;                                                                                                    \
-            }                                                                                                                            \
+/* to = map column, four rows at a time, which have their own columns: those that are zero in all four cost nothing. */
+static void product(const double *map, const whole *counts, const vec *const *column, vec *to, whole rows, whole w)
+{
+    for (whole i = 0; i < rows; i += 4, counts++) {
+        for (whole v = 0; v < w; v++) {
+            vec sums[4] = {{0}, {0}, {0}, {0}};
+            const double *at = map;
+            for (whole j = 0; j < *counts; j++, at += 4) {
+                const vec x = column[j][v];
+                sums[0] += at[0] * x, sums[1] += at[1] * x, sums[2] += at[2] * x, sums[3] += at[3] * x;
+            }
+            for (whole k = 0; k < 4 && i + k < rows; k++) to[(i + k) * MOST + v] = sums[k];
+        }
+        map += 4 * *counts, column += *counts;
     }
-PRODUCT(product, double, 1)
-PRODUCT(product_each, vec, MOST)
+}
+
+/* The same with a map of every machine's own. */
+static void product_each(const vec *map, whole columns, const vec *const *column, vec *to, whole rows, whole w)
+{
+    for (whole i = 0; i < rows; i++)
+        for (whole v = 0; v < w; v++) {
+            vec sum = {0};
+            for (whole j = 0; j < columns; j++) sum += map[(i * columns + j) * MOST + v] * column[j][v];
+            to[i * MOST + v] = sum;
+        }
+}
 
 /* Whether the next states and corrections of all machines are within the bounds. */
 static int within(const relift_job *s, whole o, whole rows, const vec *next, whole lanes)
@@ -210,58 +216,133 @@ static int within(const relift_job *s, whole o, whole rows, const vec *next, who
     return inside;
 }
 
+static int any(mask where)
+{
+    int64_t some = 0;
+    for (whole b = 0; b < WIDE; b++) some |= where[b];
+    return some != 0;
+}
+
+static vec level(vec age, vec half)
+{
+    const vec ratio = age / half;
+    return ratio * ratio / (1.0 + ratio * ratio);
+}
+
+/* Gaps of a filter bank, see kros.observer.filter_bank for the symbols: measurements and what stands for missing ones, into states; straight lines
+   over gaps that end. `held` is the fallback. */
+static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg, vec *y, vec *held, mask *missing, whole n, whole w)
+{
+    const whole r = s->filters, recorded = s->recorded;
+    for (whole j = 0; j < s->q; j++)
+        for (whole v = 0; v < w; v++) {
+            const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
+            const vec seen = y[row], count = gap[2 * recorded * MOST + row], last = reg[(n - recorded) * MOST + i] + gap[i];
+            const vec reach = (1.0 - level(gap[recorded * MOST + i], bank[recorded * MOST + i])) * s->reach[j];
+            const vec apart = reg[i] - last, near = either(apart < -reach, -reach, either(apart > reach, reach, apart));
+            const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
+            const vec jump = either(ends, (seen - (last + near)) / (count + 1.0), (vec){0});
+            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(2 * recorded + s->q + j * r + l) * MOST + v] * jump;
+            held[row] = last, missing[row] = lost;
+            reg[i] = y[row] = either(lost, last + near, seen);
+        }
+}
+
+/* The fallback into the next estimates; ages, ramps and offsets move on. */
+static void follow(const relift_job *s, const vec *bank, vec *gap, const vec *reg, vec *next, const vec *held, const mask *missing, vec *ramp, whole n, whole columns, whole w)
+{
+    const whole r = s->filters, q = s->q, recorded = s->recorded;
+    for (whole v = 0; v < w; v++) {
+        mask some = {0};
+        vec longest = {0};
+        for (whole j = 0; j < q; j++) {
+            const mask lost = missing[j * MOST + v];
+            vec *count = gap + (2 * recorded + j) * MOST + v, *of = gap + (2 * recorded + q + j * r) * MOST + v;
+            const int moves = any(lost | (*count > 0.0));
+            *count = either(lost, *count + 1.0, (vec){0});
+            longest = either(*count > longest, *count, longest);
+            some |= lost;
+            for (whole i = 0; i < r && moves; i++) {
+                const double *row = s->map + (recorded + i) * columns;
+                vec sum = row[s->measured[j]] * *count;
+                for (whole l = 0; l < r; l++) sum += row[recorded + l] * of[l * MOST];
+                ramp[i] = sum;
+            }
+            for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
+        }
+        for (whole i = 0; i < recorded; i++) {
+            vec last = reg[i * MOST + v], *offset = gap + i * MOST + v, *age = offset + recorded * MOST;
+            double hidden = 1.0;
+            const vec *of = bank + i * MOST + v, half = of[recorded * MOST];
+            const vec oldest = of[3 * recorded * MOST], fallback = reg[(n - recorded + i) * MOST + v];
+            for (whole j = 0; j < q; j++)
+                if (s->measured[j] == i) last = either(missing[j * MOST + v], held[j * MOST + v], last), hidden = 0.0;
+            *offset = of[0] * (last - fallback + hidden * level(*age, half) * (*offset - last + fallback));
+            const vec recovered = either(some, *age, of[2 * recorded * MOST] * either(*age > oldest, oldest, *age));
+            *age = either(longest > recovered, longest, recovered);
+            next[i * MOST + v] += hidden * level(*age, half) * (next[(n - recorded + i) * MOST + v] + *offset - next[i * MOST + v]);
+        }
+    }
+}
+
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q;
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? 2 * recorded + q + q * s->filters : 0;
+    vec *bank = vectors(4 * recorded), *gap = vectors(gaps), *held = vectors(q), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;
-    double *map = room(rows * columns * (whole)sizeof(double));
-    const vec **column = room(columns * (whole)sizeof(vec *));
-    int failed = !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
+    const whole groups = (rows + 3) / 4;
+    double *map = room(4 * groups * columns * (whole)sizeof(double));
+    const vec **column = room(groups * columns * (whole)sizeof(vec *));
+    whole *counts = room(groups * (whole)sizeof(whole));
+    int failed = !counts || !bank || !gap || !held || !missing || !ramp || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
     for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
         const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
         settle(f, reg, first, batch, lanes);
         if (s->own)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
+        for (whole i = 0; i < 4 * recorded; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
+        for (whole i = 0; i < gaps; i++) gather(gap + i * MOST, s->gap + i * batch + first, 1, lanes);
         for (whole o = 0; o < s->observers; o++) {
             double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;
-            whole used = 0;
             for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
             for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
             for (whole e = 0; e < ne; e++) gather(reg + (n + e) * MOST, past + e, ne, lanes);
-            for (whole j = 0; j < columns; j++) { /* columns that are zero, such as those of a shorter correction than another's, cost nothing */
-                const double *from = s->map + o * rows * columns + j;
-                whole there = s->own;
-                for (whole i = 0; i < rows && !there; i++) there = from[i * columns] != 0.0;
-                if (!there) continue;
-                whole k = j;
-                if (k < f->n_lifted) column[used] = reg + f->lifted[k] * MOST;
-                else if ((k -= f->n_lifted) < order) column[used] = c + k * MOST;
-                else if ((k -= order) < f->n_inputs) column[used] = reg + f->lifted[f->n_lifted + k] * MOST;
-                else column[used] = y + (k - f->n_inputs) * MOST;
-                for (whole i = 0; i < rows; i++) map[i * columns + used] = from[i * columns];
-                used++;
+            for (whole i = 0, used = 0, at = 0; i < rows; i += s->own ? rows : 4) {
+                const whole before = used;
+                for (whole j = 0; j < columns; j++) {
+                    const double *from = s->map + (o * rows + i) * columns + j;
+                    whole there = s->own, k = j;
+                    for (whole l = 0; l < 4 && i + l < rows && !there; l++) there = from[l * columns] != 0.0;
+                    if (!there) continue;
+                    if (k < f->n_lifted) column[used++] = reg + f->lifted[k] * MOST;
+                    else if ((k -= f->n_lifted) < order) column[used++] = c + k * MOST;
+                    else if ((k -= order) < f->n_inputs) column[used++] = reg + f->lifted[f->n_lifted + k] * MOST;
+                    else column[used++] = y + (k - f->n_inputs) * MOST;
+                    for (whole l = 0; l < 4 && !s->own; l++) map[at++] = i + l < rows ? from[l * columns] : 0.0;
+                }
+                counts[i / 4] = used - before;
             }
-            for (whole i = 1; i < rows && used < columns && !s->own; i++) memmove(map + i * used, map + i * columns, (size_t)used * sizeof(double));
             for (whole k = 0; k < s->samples; k++) {
                 if (s->states)
                     for (whole i = 0; i < n; i++) scatter(s->states + ((k * s->observers + o) * n + i) * batch + first, reg + i * MOST, 1, lanes);
                 for (whole j = 0; j < q; j++) { /* what is predicted stands for what is missing */
                     const vec *x = reg + s->measured[j] * MOST;
                     gather(y + j * MOST, s->y + (k * q + j) * batch + first, 1, lanes);
-                    for (whole v = 0; v < w; v++) {
+                    for (whole v = 0; v < w && !recorded; v++) {
                         const vec seen = y[j * MOST + v];
                         y[j * MOST + v] = either(seen - seen == 0.0, seen, x[v]);
                     }
                 }
-                for (whole j = 0; j < q && s->overwrite; j++) memcpy(reg + s->measured[j] * MOST, y + j * MOST, MOST * sizeof(vec));
+                if (recorded) fill(s, bank, gap, reg, y, held, (mask *)missing, n, w);
                 for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
                 for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
                 evaluate(f, reg, lanes);
                 if (s->own) product_each(each, columns, column, next, rows, w);
-                else product(map, used, column, next, rows, w);
+                else product(map, counts, column, next, rows, w);
                 shifted(f, reg, older);
+                if (recorded) follow(s, bank, gap, reg, next, held, (const mask *)missing, ramp, n, columns, w);
                 if (!within(s, o, rows, next, lanes)) {
                     s->left[o] = 1;
                     break;
@@ -274,8 +355,9 @@ int kros_relift(const formulas *f, const relift_job *s)
             for (whole i = 0; i < order; i++) scatter(state + (f->n_lifted + i) * batch, c + i * MOST, 1, lanes);
             for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
         }
+        for (whole i = 0; i < gaps; i++) scatter(s->gap + i * batch + first, gap + i * MOST, 1, lanes);
     }
-    free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column);
+    free(bank), free(gap), free(held), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);
     return failed;
 }
 

@@ -28,10 +28,7 @@ from typing import Any
 import numpy as np
 
 from ..core.arrays import Array, Flags, frozen
-from ..core.rounding import ITERATED
 from .checked import floats
-
-_FORGOTTEN = ITERATED  # samples: an age whose square counts as nothing beside any half
 
 
 @frozen
@@ -65,20 +62,25 @@ class Gaps:
     """State of the gaps of filter banks over a batch of machines."""
 
     def __init__(self, bank: FilterBank, A: Array, measured: tuple[int, ...], recorded: int, batch: int) -> None:
-        n, q, first = len(A), len(measured), recorded
+        n, q = len(A), len(measured)
         self.bank, self.measured, self.recorded = bank, list(measured), recorded
-        self.filters = slice(first, first + bank.filters)
+        self.filters = slice(recorded, recorded + bank.filters)
         self.fallback = slice(n - recorded, n)
         self._A, self._B = A[self.filters, self.filters], A[self.filters, :][:, self.measured]
-        self.offset, self.age = np.zeros((2, batch, recorded))
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
         self.held = np.zeros((batch, q))  # the fallback of measurements
-        self.ramp, self.count = np.zeros((batch, bank.filters, q)), np.zeros((batch, q))
+        self.take(np.zeros((2 * recorded + q + q * bank.filters, batch)))
+
+    def take(self, state: Array) -> None:
+        """Go on from a state whose rows are offsets, ages, counts and ramps of all machines."""
+        n, q = self.recorded, len(self.measured)
+        self.state = state
+        self.offset, self.age, self.count, ramp = np.split(state.T, np.cumsum([n, n, q]), axis=1)
+        self.ramp = ramp.reshape(len(ramp), q, -1).swapaxes(1, 2)
 
     def begin(self, rows: Any) -> None:
         """Start some machines: nothing is missing."""
-        for values in (self.offset, self.age, self.ramp, self.count):
-            values[rows] = 0.0
+        self.state[:, rows] = 0.0
 
     def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
@@ -95,20 +97,12 @@ class Gaps:
             x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
         x[:, self.measured] = np.where(missing, expected, y)
 
-    def apart(self, x: Array, y: Array) -> Array:
-        """Return the next offset from the fallback, after states (batch, n) and measurements, (batch, q)."""
-        last = x[:, : self.recorded].copy()
-        last[:, self.measured] = y
-        fallback, share = x[:, self.fallback], self.hidden * self.bank.level(self.age)
-        return self.bank.forget * (last - fallback + share * (self.offset - last + fallback))
-
     def follow(self, x: Array, following: Array, missing: Flags) -> None:
         """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""
         bank, some = self.bank, np.asarray(missing.any(axis=1))
-        offset = self.apart(x, np.where(missing, self.held, x[:, self.measured]))
-        if not some.any() and not (self.age > _FORGOTTEN).any():
-            self.offset, self.age[...], self.count[...] = offset, 0.0, 0.0
-            return
+        last, fallback, share = x[:, : self.recorded].copy(), x[:, self.fallback], self.hidden * bank.level(self.age)
+        last[:, self.measured] = np.where(missing, self.held, x[:, self.measured])
+        offset = bank.forget * (last - fallback + share * (self.offset - last + fallback))
         count = np.where(missing, self.count + 1, 0.0)
         recovered = np.where(some[:, None], self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
         age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))
@@ -117,5 +111,18 @@ class Gaps:
         following[:, : self.recorded] += share * (fallback - following[:, : self.recorded])
         if some.any() or self.count.any():
             ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
-            self.ramp = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)
-        self.offset, self.age, self.count = offset, age, count
+            self.ramp[...] = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)
+        self.offset[...], self.age[...], self.count[...] = offset, age, count
+
+    @property
+    def job(self) -> dict[str, Any]:
+        """What the compiled loop needs of gaps."""
+        bank = self.bank
+        rows = bank.forget, bank.half, bank.recovery, longest_age(bank.half)
+        return {
+            "recorded": self.recorded,
+            "filters": bank.filters,
+            "reach": bank.reach,
+            "bank": np.stack([np.broadcast_to(row, self.age.shape).T for row in rows]),
+            "gap": self.state.copy(),
+        }

@@ -19,6 +19,7 @@ its start: while they go by, all that the monitor remembers is held.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -102,18 +103,22 @@ class Monitor:
         return (levels * self.weights).sum(axis=(-2, -1)) / WEIGHT
 
 
-def octaves(count: int = 6, quality: float = 1.4) -> Array:
+def octaves(count: int = 6) -> Array:
     """Return band-pass filters of order two, (count, 3), an octave apart, from half the Nyquist frequency down."""
     w = 2 * np.pi * 0.256 / 2.0 ** np.arange(count)
-    alpha = np.sin(w) / (2 * quality)
+    alpha = np.sin(w) / 2.8  # of quality 1.4
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
 
 
 def judged_samples(settle: int, status: AnyArray, starts: Flags, moving: Flags) -> Flags:
     """Return which samples are judged, as a running observer does it; status and flags (n_samples, batch)."""
     judged, wait = np.zeros(status.shape, dtype=bool), np.zeros(status.shape[1], dtype=int)
-    for k in range(len(status)):
-        judged[k], wait = judge(wait, settle, status[k] != 0, starts[k], moving[k])
+    bad, quiet = status != 0, np.arange(len(status))[:, None]
+    events = np.flatnonzero((bad | starts | ~moving).any(axis=1))  # the first sample, which is a start, is one
+    for k, stop in pairwise([*events, len(status)]):
+        judged[k], wait = judge(wait, settle, bad[k], starts[k], moving[k])
+        judged[k + 1 : stop] = quiet[: stop - k - 1] >= wait
+        wait = np.maximum(wait - (stop - k - 1), 0)
     return judged
 
 

@@ -143,7 +143,7 @@ class Screen:
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m); `held` is known before the first."""
-        before, z, q = Held.nothing(*u.shape[1:]) if held is None else held, np.concatenate([y, u], axis=-1), self.q
+        before, z, q = Held.nothing(*u.shape[1:]) if held is None else held, np.array([*y.T, *u.T]).T, self.q
         plausible, finite = (z >= self.least) & (z <= self.most), np.isfinite(z)
         within = np.minimum(np.maximum(z, self.lower), self.upper)
         beyond = (finite & (~plausible | (within != z))).any(axis=-1)

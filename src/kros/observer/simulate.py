@@ -70,7 +70,8 @@ def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, paramet
     """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
     samples = screened(observers[0], y, u)
     courses = [Course(observer, samples.starts.shape[1], parameters) for observer in observers]
-    return np.stack([run.estimates for run in _run(courses, samples)])
+    first, *others = [run.estimates[None] for run in _run(courses, samples)]
+    return np.concatenate([first, *others]) if others else first  # one may be large: it is not copied
 
 
 def run_innovations(
@@ -84,9 +85,9 @@ def run_innovations(
 
 def _run(courses: Sequence[Course], samples: Screened) -> list[Stepped]:
     """Run observers of one model on: compiled where they go on side by side within their bounds, else in NumPy."""
-    loops, runs = library(), list[Stepped | None]([None] * len(courses))
-    if loops is not None and all(course.even(samples) for course in courses):
-        runs = _compiled(loops, courses, samples)
+    loops, alone = library(), len(courses) == 1 or courses[0].steps.gaps is None
+    even = alone and all(course.even(samples) for course in courses)
+    runs = [None] * len(courses) if loops is None or not even else _compiled(loops, courses, samples)
     finished = [run or stepped(course, samples) for run, course in zip(runs, courses, strict=True)]
     for run, course in zip(finished, courses, strict=True):
         course.observer.runtime.clip_estimate(run.estimates, out=run.estimates)
@@ -146,12 +147,11 @@ class Course:
         return replace(run, status=run.status | samples.status)
 
     def even(self, samples: Screened) -> bool:
-        """Whether machines go on side by side: none starts again, settles, fills a gap, follows or looks far back."""
+        """Whether machines go on side by side: none starts again, settles, follows or looks far back."""
         steps, starts = self.steps, samples.starts[self._before is None :]
-        gaps = steps.gaps is not None and bool(steps.gaps.age.any() or not np.isfinite(samples.y).all())
-        far = self.observer.runtime.delay and self.observer.lifting.history
+        far = self.observer.runtime.delay and (self.observer.lifting.history or steps.gaps is not None)
         apart = starts.any() or steps.waiting.any() or self.settling.any() or np.ptp(self.since)
-        return not (gaps or far or apart or self.loop is not None)
+        return not (far or apart or self.loop is not None)
 
     def enter(self, samples: Screened) -> tuple[Screened, int]:
         """Start at the first sample of all; return samples behind those that inputs are still needed of, a number."""
@@ -245,7 +245,7 @@ def _compiled(loops: Library, courses: Sequence[Course], samples: Screened) -> l
         steps.x, steps.x_c = column[:n].T.copy(), column[nl : nl + steps.x_c.shape[1]].T.copy()
         steps.past, steps.fresh = job["past"][i], steps.fresh & (first == n_samples)
         if steps.gaps is not None:
-            steps.gaps.offset = steps.gaps.apart(x[-1], samples.y[-1])
+            steps.gaps.take(job["gap"])
         course.since[:] = late[-1]
         course.leave(samples)
         innovation = np.where(np.isfinite(samples.y), samples.y - x[..., list(observer.measured)], 0.0)
@@ -268,7 +268,6 @@ def _job(courses: Sequence[Course], samples: Screened, u: Array) -> dict[str, An
         "batch": batch,
         "order": order,
         "q": len(observer.measured),
-        "overwrite": int(observer.bank is not None),
         "map": np.stack([_padded(c.observer, order) for c in courses]),
         "y": samples.y.swapaxes(1, 2),
         "u": u.swapaxes(1, 2),
@@ -277,6 +276,8 @@ def _job(courses: Sequence[Course], samples: Screened, u: Array) -> dict[str, An
         "fresh": int(courses[0].steps.fresh.any()),
         "left": np.zeros(len(courses), np.uint8),
     }
+    if (gaps := courses[0].steps.gaps) is not None:
+        job |= gaps.job
     job["low"], job["high"] = np.swapaxes([bounds(c.observer.guard, n, order) for c in courses], 0, 1)
     job["column"] = np.zeros((len(courses), job["map"].shape[2], batch))
     for column, course in zip(job["column"], courses, strict=True):

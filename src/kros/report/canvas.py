@@ -69,7 +69,7 @@ def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
         figure.legend(handles, labels, loc="outside upper left", ncols=columns)
 
 
-def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float] = (0, 0), **options: Any) -> None:
+def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **options: Any) -> None:
     """Write a small text at a place in shares of the axes, moved by an offset in points."""
     settings: dict[str, Any] = {"xycoords": "axes fraction", "size": "small"} | options
     axes.annotate(text, at, xytext=offset, textcoords="offset points", **settings)
@@ -93,12 +93,10 @@ def decibel(values: ArrayLike) -> AnyArray:
     return 20 * np.log10(np.where(magnitude > 0, magnitude, np.nan))
 
 
-def line_over_shade(
-    axes: Axes, freqs_hz: AnyArray, line: AnyArray, shade: AnyArray, colour: str, style: str = "-"
-) -> None:
+def line_over_shade(axes: Axes, freqs_hz: AnyArray, line: AnyArray, shade: AnyArray, colour: str) -> None:
     """Draw magnitudes over frequency in dB, above a broad light line of what they are compared with."""
     axes.plot(freqs_hz, decibel(shade), color=colour, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
-    axes.plot(freqs_hz, decibel(line), style, color=colour)
+    axes.plot(freqs_hz, decibel(line), color=colour)
 
 
 def lines_of_units(axes: Axes, x: AnyArray, lines: AnyArray, colour: str, label: str, units: Sequence[str]) -> None:

@@ -42,7 +42,7 @@ def unreachable_modes(A: AnyArray, B: AnyArray, dt: float) -> list[complex]:
     return [complex(mode) for mode, s in zip(outside, sizes, strict=True) if s[-1] <= ITERATED * max(s[0], TINY)]
 
 
-def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> dict[tuple[str, str], str]:
+def h2_violations(plant: GeneralizedPlant, proper: bool) -> dict[tuple[str, str], str]:
     """Check every assumption of H2 synthesis and return those that fail, with the values."""
     p, failed = plant, {}
     sides = (p.A, p.B2, p.C1, p.D12), (p.A.T, p.C2.T, p.B1.T, p.D21.T)

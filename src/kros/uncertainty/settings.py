@@ -126,6 +126,7 @@ class SetRule:
     entry_order: int = 3  # of fits to single entries, which are shown and decide nothing
     entry_db: float = 1.0  # above an entry, at which a lower order of its fit is good enough
     singular: float = 1e10  # condition beyond which the paper's weights have no inverse
+    retained: int = 500_000  # units times frequencies, at most, whose residuals are not computed for every proof again
     at_once: int = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
 
 

@@ -227,7 +227,7 @@ def _examined(
 ) -> Discovery:
     """Look at every episode, leave out what cannot be used, and complete the description."""
     population, mapping, notes = draft.population, draft.mapping, dict(draft.notes)
-    looks = examine(population, work)
+    looks = examine(population, work or Work())
     wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
     nan = [s for s in good if s.nan]
     bridged = len(nan) if min((s.n_samples for s in nan), default=0) >= RULE.shortest_piece else 0

@@ -42,10 +42,10 @@ class EpisodeLook:
     digest: str = ""
 
 
-def examine(population: Population, work: Work | None = None) -> list[EpisodeLook]:
+def examine(population: Population, work: Work) -> list[EpisodeLook]:
     """Read every episode once, as it was recorded, and say what is wrong with it alone or beside the others."""
     tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
-    looks = [look for group in (work or Work()).map("look", _look, tasks) for look in group]
+    looks = [look for group in work.map("look", _look, tasks) for look in group]
     copies = dict(copies_among((s.key, s.digest) for s in looks if s.digest and not s.wrong))
     return [replace(s, wrong=f"a copy of {copies[s.key]}") if s.key in copies else s for s in looks]
 

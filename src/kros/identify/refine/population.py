@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Whole
+from ...core.arrays import Array, Flags
 from ...core.errors import IdentificationError
 from ...core.linalg import qr_triangle, radius_text
 from ...core.rounding import EPS, TINY
@@ -27,7 +27,7 @@ from ..factors import Factor, Ranges
 from ..free_run import free_run
 from .metric import ResponsePrior, peak_residual
 from .problem import OneStep, RefinementProblem, stability_barrier
-from .search import Evaluate, GaussNewton, RefineOptions, Solution
+from .search import GaussNewton, RefineOptions, Solution
 from .segments import Segments, TrainingData, held_segments, read_segments
 
 log = logging.getLogger(__name__)
@@ -137,11 +137,7 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
 
 def _fit(problem: RefinementProblem, V: Array, search: GaussNewton) -> Solution:
     """Fit every unit by itself; those that are done are not run on."""
-
-    def narrowed(rows: Whole) -> Evaluate:
-        return problem.of_units(rows).evaluate
-
-    return search.minimise(problem.evaluate, problem.admissible, V, narrowed)
+    return search.minimise(problem.evaluate, problem.admissible, V, lambda rows: problem.of_units(rows).evaluate)
 
 
 def _choose(scores: Array, peaks: Array, options: RefineOptions) -> int:
@@ -254,7 +250,7 @@ def free_run_errors(
         values = {name: given[part] for name, given in parameters.items()}
         x, u = (np.ascontiguousarray(np.swapaxes(signal, 0, 1)) for signal in (batch.states, batch.inputs))
         runs = free_run(models.A[part], models.B[part], lifting, values, x[:, : lifting.history + 1], u)
-        inside = (np.arange(x.shape[1]) < batch.lengths[:, None])[..., None]
+        inside = batch.inside.T[..., None]
         with np.errstate(over="ignore", invalid="ignore"):
             squares = np.where(inside, (runs - x) ** 2, 0.0).sum(axis=1) / batch.lengths[:, None]
             errors.append((np.sqrt(squares), np.where(inside, np.abs(runs), 0.0).max(axis=1)))

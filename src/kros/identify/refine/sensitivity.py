@@ -52,7 +52,7 @@ def normal_equations(
     parameters: Mapping[str, Array],
     segments: Segments,
     sigma: Array,
-    stride: int = 1,
+    stride: int,
 ) -> Normal:
     """Run all segments with their unit's model; add up normal equations over sigma (n,), every `stride` steps."""
     n, h = lifting.n_states, segments.history

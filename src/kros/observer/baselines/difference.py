@@ -33,7 +33,7 @@ class FilteredDifference:
 
     def scaled_to(self, batch: EpisodeBatch, measured: Sequence[int]) -> FilteredDifference:
         """Return the same with the scales that fit recordings best, so that units of measure do not matter."""
-        y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
+        y, inside = batch.measurements(measured, arrived=False), batch.inside
         found, states = rates(y, self.cutoff_hz, self.sample_period_s)[inside], batch.states[inside]
         both = [(found[:, i], states[:, j]) for i, j in self.pairs]
         return replace(self, scales=tuple(float(r @ x / (r @ r)) if r.any() else 1.0 for r, x in both))
@@ -48,16 +48,16 @@ def rates(y: Array, cutoff_hz: float, sample_period_s: float) -> Array:
     return lfilter(*butter(2, cutoff_hz, fs=1 / sample_period_s), rate, axis=0)
 
 
-def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:
-    """Return which states are rates of measured ones: these explain a share of their variance, whatever the units."""
-    y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
+def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, int], ...]:
+    """Return which states are rates of measured ones: these explain half of their variance, whatever the units."""
+    y, inside = batch.measurements(measured, arrived=False), batch.inside
     states, dt = batch.states[inside].T, batch.sample_period_s
     share = np.zeros((len(measured), len(states)))
     for cutoff in cutoffs_hz(dt)[::4]:
         pairs = product(rates(y, cutoff, dt)[inside].T, states)
         share = np.maximum(share, np.reshape([_explained(*pair) for pair in pairs], share.shape))
     share[:, list(measured)] = 0.0
-    best = [(i, int(j)) for i, j in enumerate(share.argmax(axis=1)) if share[i, j] > explained]
+    best = [(i, int(j)) for i, j in enumerate(share.argmax(axis=1)) if share[i, j] > 0.5]
     return tuple((i, j) for i, j in best if share[:, j].argmax() == i)
 
 

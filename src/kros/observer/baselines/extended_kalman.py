@@ -45,7 +45,7 @@ class ExtendedKalman:
         return self.run_all(y, u, parameters)[0]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def run_all(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
+    def run_all(self, y: Array, u: Array, parameters: Parameters | None) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
         lifting, n, C, (n_samples, batch) = self.lifting, self.lifting.n_states, list(self.measured), y.shape[:2]
         values = {**self.parameters, **(parameters or {})}

@@ -244,7 +244,7 @@ def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> 
 
 
 def slope_box(
-    observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None
+    observer: ObserverData, names: Sequence[str], box: Box | None, parameters: Box | None
 ) -> tuple[Array, Array]:
     """Return bounds of the slopes of all functions by entries of the window, each (p + r, len(names))."""
     formulas = observer.lifting.formulas + observer.lifting.input_formulas

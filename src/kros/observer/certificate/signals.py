@@ -158,7 +158,7 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
     samples = screened(observer, y, inputs)
     bad = ~np.isfinite(samples.y).all(axis=-1) | (samples.u != inputs).any(axis=-1)
-    refused = (bad & (np.arange(len(bad))[:, None] < batch.lengths)).any(axis=0)
+    refused = (bad & batch.inside).any(axis=0)
     noise = np.where(np.isfinite(samples.y), samples.y, y)[:-1] - states[due][:-1][..., at]
     noise[:late] = 0.0
     omega = held_residual(observer, states, inputs, values)

@@ -62,8 +62,8 @@ class Bank:
         moving, past = v[:, :-1], v[:, : self.delayed]
         before = np.concatenate([np.repeat(past[:1], self.taps[-1], axis=0), past])
         sums = np.concatenate([np.zeros((1, self.delayed)), np.cumsum(before - past[:1], axis=0)])
-        ends = at + self.taps[-1] + 1
-        means = [(sums[ends - a] - sums[ends - b]) / (b - a) for a, b in pairwise(self.taps)]
+        ends = [(tap, sums[at + self.taps[-1] + 1 - tap]) for tap in self.taps]
+        means = [(one - other) / (b - a) for (a, one), (b, other) in pairwise(ends)]
         parts = [moving[at], *(one - other for one, other in pairwise(means))]
         if self.lags:
             parts.append(lagged(moving, np.exp(-1 / np.array(self.lags)), at))

@@ -177,11 +177,11 @@ def _inside(values: AnyArray, recorded: AnyArray) -> AnyArray:
     return np.where((values >= recorded.min() - room) & (values <= recorded.max() + room), values, np.nan)
 
 
-def draw_lines(axes: Axes, time_s: AnyArray, lines: Lines, width: float = 1.0) -> None:
+def draw_lines(axes: Axes, time_s: AnyArray, lines: Lines) -> None:
     """Draw lines over time, later ones in front."""
     for label, (values, look) in lines.items():
         x, y = thin(time_s, values)
-        axes.plot(x, y, look.style, color=look.colour, alpha=look.opacity, label=label, lw=width * look.weight)
+        axes.plot(x, y, look.style, color=look.colour, alpha=look.opacity, label=label, lw=look.weight)
     axes.set_xlim(time_s[0], time_s[-1])
 
 

@@ -45,7 +45,7 @@ STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYN
 Judged = list[tuple[Array, Flags]]  # innovations, and which samples are judged
 
 
-def check_units(run: Path, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:
+def check_units(run: Path, data: Path, workers: int, same_unit: bool) -> Rows:
     """Identify the units of some recordings as the study did, score each against its population, and give a verdict.
 
     A name of a unit of the study is refused for other recordings, unless `same_unit` says it is the same machine.

@@ -58,7 +58,7 @@ def simulate_to(out: Path, simulation: Simulation) -> None:
 
 
 def run_demo(
-    out: Path, simulation: Simulation, workers: int, progress: Progress, overrides: Sequence[str] = ()
+    out: Path, simulation: Simulation, workers: int, progress: Progress, overrides: Sequence[str]
 ) -> RunResult:
     """Simulate a population and run the study on it, all below one folder; what is there is not simulated again."""
     out = Path(out).absolute()

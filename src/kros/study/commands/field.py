@@ -41,7 +41,7 @@ _BLOCK = 20_000  # samples of an episode that are run at once
 _BATCH = 20  # shorter episodes that run side by side
 
 
-def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
+def open_data(config: StudyConfig, data: Path, optional: Collection[str]) -> Population:
     """Open a folder with the run's reader, or what a TOML with ``[data]`` names; `optional` channels may be absent."""
     section = config.data
     if data.is_file():
@@ -171,16 +171,16 @@ class FieldRecordings:
                 sources[unit] = f"tracked from the value {start}"
         return replace(self, values=values, sources=sources)
 
-    def _start(self, unit: str, name: str, phases: int = 24) -> float:
+    def _start(self, unit: str, name: str) -> float:
         """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
         chosen, values = dict[EpisodeKey, Array](), self.values[unit]
         for key in self.population.keys(unit)[:_BATCH]:
             if sum(map(len, chosen.values())) < _BLOCK:
                 chosen[key] = next(self.population.blocks(key, _BLOCK))
         arrived = arriving(self.observer, self.population, chosen, {unit: values})
-        step, known = 2 * np.pi / phases, {**self.observer.parameters, **values}
+        step, known = 2 * np.pi / 24, {**self.observer.parameters, **values}
         signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
-        coarse = least_innovation(*signals, np.arange(phases) * step)
+        coarse = least_innovation(*signals, np.arange(24) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
     @cached_property

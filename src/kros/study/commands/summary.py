@@ -78,7 +78,7 @@ def list_run(run: Path) -> list[str]:
         return [*lines, "the run has not ended; the same command of kros run goes on with it"]
 
 
-def compare_runs(runs: Sequence[Path], out: Path | None = None) -> tuple[dict[str, Any], list[str]]:
+def compare_runs(runs: Sequence[Path], out: Path | None) -> tuple[dict[str, Any], list[str]]:
     """Return finished runs beside each other, as content of JSON and as lines; written as a page to `out`."""
     if len(set(runs)) < 2:
         raise ConfigError(f"Compare: at least two runs are needed, found {len(set(runs))}; name another run folder.")

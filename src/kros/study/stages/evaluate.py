@@ -13,7 +13,6 @@ import numpy as np
 from ...core.arrays import AnyArray, Array
 from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
-from ...data.population import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
@@ -76,11 +75,7 @@ def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome | st
         baseline = make()
     except KrosError as error:
         return str(error)
-
-    def run(keys: Sequence[EpisodeKey], y: Array, u: Array, values: Mapping[str, Array]) -> list[Array]:
-        return [baseline.estimate(keys, y, u, values)[None]]
-
-    (outcome,) = episodes.estimates(run, baseline.measured)
+    (outcome,) = episodes.estimates(lambda *batch: [baseline.estimate(*batch)[None]], baseline.measured)
     return replace(outcome, facts=baseline.facts, estimated=baseline.estimated)
 
 

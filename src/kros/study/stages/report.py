@@ -24,7 +24,7 @@ def run(context: Context) -> None:
     render(context.store.folder, metrics, partial(context.work.map, "report"), context.store.draft(REPORT))
 
 
-def render_run(folder: Path, workers: int = 1) -> Path:
+def render_run(folder: Path, workers: int) -> Path:
     """Write the report of a finished run again; `workers` processes draw its figures."""
     from ...report.html import render
 

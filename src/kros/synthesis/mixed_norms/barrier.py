@@ -198,8 +198,10 @@ def _line_search(slope: float, eigenvalues: AnyArray) -> float:
     from scipy.optimize import minimize_scalar
 
     limit = 1 / max(-float(eigenvalues.min(initial=0.0)), 0.01)
-
-    def barrier(t: float) -> float:
-        return slope * t - float(np.log(np.maximum(1 + t * eigenvalues, TINY)).sum())
-
-    return float(minimize_scalar(barrier, bounds=(0.0, limit), method="bounded", options={"xatol": 1e-3}).x)
+    result = minimize_scalar(
+        lambda t: slope * t - float(np.log(np.maximum(1 + t * eigenvalues, TINY)).sum()),
+        bounds=(0.0, limit),
+        method="bounded",
+        options={"xatol": 1e-3},
+    )
+    return float(result.x)

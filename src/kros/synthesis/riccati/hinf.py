@@ -103,12 +103,12 @@ def _closed(plant: GeneralizedPlant, K: StateSpace | None) -> _Loop:
         return _Loop(None)
 
 
-def _search(frame: Frame, idle: _Loop, tolerance: float, negligible: float, steps: int = 60) -> tuple[_Loop, float]:
+def _search(frame: Frame, idle: _Loop, tolerance: float, negligible: float) -> tuple[_Loop, float]:
     """Return the best loop and the largest level that is out of reach, by bisection of the levels between them."""
     best, proven = idle, frequency_bound(frame.scaled)
     lower = low = proven
     level, high = max(2 * proven, 1.0), best.norm
-    for _ in range(steps):
+    for _ in range(60):
         if best.norm <= max(lower * (1 + tolerance), negligible) or high <= low * (1 + tolerance / 8):
             break
         if np.isfinite(high):

@@ -19,7 +19,7 @@ from ..generalized_plant import GeneralizedPlant
 _RANK = float(np.sqrt(EPS))  # relative: signals that are smaller prove nothing
 
 
-def frequency_bound(p: GeneralizedPlant, rounds: int = 5) -> float:
+def frequency_bound(p: GeneralizedPlant) -> float:
     """Return the largest bound of the frequencies around all poles, refined around the largest some rounds."""
     sides = (p.A, p.B1, p.C1, p.D11, p.C2, p.D21), (p.A.T, p.C1.T, p.B1.T, p.D11.T, p.B2.T, p.D12.T)
     best = 0.0
@@ -28,7 +28,7 @@ def frequency_bound(p: GeneralizedPlant, rounds: int = 5) -> float:
         free = null_space(D_y)
         best = max(best, float(np.linalg.norm(D @ free, 2)) if D.size and free.size else 0.0)
         points = _grid(A, p.dt) if len(A) and D.size else np.zeros(0)
-        for _ in range(rounds if points.size else 0):
+        for _ in range(5 if points.size else 0):
             bounds = _bounds(side, points, p.dt)
             k = int(np.argmax(bounds))
             best = max(best, float(bounds[k]))

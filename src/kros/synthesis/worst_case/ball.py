@@ -142,25 +142,23 @@ def _without_centre(s: AnyArray, q: AnyArray) -> tuple[AnyArray, AnyArray]:
     return g[..., :rows], np.maximum(s**2 * q**2 - g, 0.0)[..., :columns]
 
 
-def _descended(
-    c: AnyArray, d: AnyArray, g: AnyArray, multipliers: AnyArray, sweeps: int = 10
-) -> tuple[AnyArray, AnyArray]:
+def _descended(c: AnyArray, d: AnyArray, g: AnyArray, multipliers: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return better multipliers of rows and columns, by turns; sums run with frequencies last."""
     c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
     c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
     rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)
-    for _ in range(sweeps):
+    for _ in range(10):
         rows = _best_rows(c, columns - d)
         columns = _best_rows(c_columns, rows - d_columns)
     return np.moveaxis(rows, 0, -1), np.moveaxis(columns, 0, -1)
 
 
-def _best_rows(c: AnyArray, shift: AnyArray, steps: int = 4) -> AnyArray:
+def _best_rows(c: AnyArray, shift: AnyArray) -> AnyArray:
     """Minimise ``x + sum_j c_ij / (x + shift_ij)`` over ``x >= 0``, ``x + shift_ij >= 0``, for every row i."""
     least = np.maximum(np.max(-shift, axis=1), 0.0)
     gap = least[:, None] + shift
     x = np.maximum(np.max(np.sqrt(c) - gap, axis=1), 0.0)
-    for _ in range(steps):
+    for _ in range(4):
         inverse = 1 / np.maximum(x[:, None] + gap, _SMALL)
         terms = c * inverse * inverse
         h = np.maximum(terms.sum(axis=1), TINY)

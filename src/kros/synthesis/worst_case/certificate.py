@@ -122,14 +122,12 @@ _ROUGH_NODES, _ROUGH_WEIGHTS = np.polynomial.legendre.leggauss(7)
 _ALL = np.concatenate([_NODES, _ROUGH_NODES])
 
 
-def circle_mean(
-    density: Callable[[AnyArray], AnyArray], centers: AnyArray, rtol: float, max_panels: int = 4000
-) -> tuple[float, float]:
+def circle_mean(density: Callable[[AnyArray], AnyArray], centers: AnyArray, rtol: float) -> tuple[float, float]:
     """Return mean and error over the circle of an even density of angles (k,); `centers` are log poles."""
     edges = _edges(centers)
     panels = _panels(density, edges[:-1], edges[1:])
     while (error := panels[3].sum()) > rtol * (total := panels[2].sum()):
-        if len(panels.T) > max_panels:
+        if len(panels.T) > 4000:
             text = f"relative error {error / total:.2g} after {len(panels.T)} panels, above {rtol:.2g}"
             raise SynthesisError(f"Integrating the density: {text}; poles are extremely close to the unit circle.")
         split = panels[3] > min(0.5 * panels[3].max(), rtol * total / len(panels.T))

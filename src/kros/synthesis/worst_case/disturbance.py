@@ -34,12 +34,12 @@ def average_disturbance(problem: ObserverProblem, max_order: int, tolerance_db: 
     return disturbed(problem, shaped, None if rest is None else filters(rest, freqs, dt, max_order, tolerance_db))
 
 
-def design_grid(problem: ObserverProblem, count: int = 400) -> AnyArray:
+def design_grid(problem: ObserverProblem) -> AnyArray:
     """Frequencies for the design, Hz: logarithmic from well below the slowest pole to Nyquist."""
     dt = problem.nominal.dt
     systems = [problem.nominal, problem.W_L, problem.W_R, problem.input_weight]
     slowest = np.abs(np.concatenate([s.poles() for s in systems]) - 1).min(initial=1.0)
-    return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, count) / (2 * np.pi * dt)
+    return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, 400) / (2 * np.pi * dt)
 
 
 def _remainder(problem: ObserverProblem, freqs_hz: AnyArray) -> AnyArray | None:

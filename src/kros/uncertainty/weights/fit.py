@@ -79,6 +79,8 @@ class _Fit:
         self.checked_hz = joined(grid, modes)
         self.freqs_hz = joined(freqs_hz, modes[self._inside(modes)])
         self.known = residuals.at(self.freqs_hz)
+        few = residuals.count * len(self.checked_hz) <= SET.retained
+        self.checked = residuals.at(self.checked_hz) if few else None
         self.optimal = optimal_cover(self.known)
 
     def _inside(self, freqs_hz: AnyArray) -> Flags:
@@ -115,7 +117,8 @@ class _Fit:
         def ratio(freqs_hz: AnyArray) -> AnyArray:
             return self.residuals.ratio(weight.magnitudes(freqs_hz), freqs_hz)
 
-        known, realised = ratio(self.checked_hz), self.residuals.realised
+        E, realised = self.checked, self.residuals.realised
+        known = ratio(self.checked_hz) if E is None else weight.magnitudes(self.checked_hz).ratio(E)
         pencils = realised.ratios(weight.left, weight.right) if realised and known.max() > 0 else []
         return certify(ratio, self.checked_hz, known, pencils, weight.left.dt), known.max(axis=0)
 

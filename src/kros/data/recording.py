@@ -241,11 +241,7 @@ def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], fi
 
 
 class GroupWatch:
-    """What only the episodes of one unit and condition show together: channels that never move, and wild samples.
-
-    A channel may rest in 99 % of an episode and then move (steps, flags, saturation), so its size is that of its
-    values, and what it moves by in half of the episodes.
-    """
+    """What only the episodes of one unit and condition show together: channels that never move, and wild samples."""
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         self._channels = channels
@@ -267,7 +263,7 @@ class GroupWatch:
         """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, median range) > 0, and the place."""
         for key, ((low, middle, high), _, samples, values) in self._signals.items():
             usual = np.quantile([of[1] for of in self._signals.values()], 0.5, axis=0, method="lower")
-            size = np.max([high - low, np.abs(low), np.abs(high), usual], axis=0)
+            size = np.max([high - low, np.abs(low), np.abs(high), usual], axis=0)  # it may rest in 99 % of an episode
             for i in map(int, np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))):
                 actual = f"{values[i]:g} at sample {samples[i]}"
                 most = f"98 % of its samples are from {low[i]:g} to {high[i]:g}"
@@ -307,10 +303,10 @@ def check_period(period_s: Any, what: str) -> float:
 
 def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey]) -> None:
     """Check names: none empty, at least one state, no channel and no episode twice."""
-    check_names("channel", [c.name for c in channels])
+    names = [c.name for c in channels]
+    check_names("channel", names)
     for kind in ("unit", "condition", "episode"):
         check_names(kind, dict.fromkeys(getattr(key, kind) for key in episodes))
-    names = [c.name for c in channels]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise DataError(f"Channel names should differ, found {twice} more than once in {names}; rename them.")
@@ -339,9 +335,8 @@ def check_population(population: Population, allow_single: bool = False) -> None
         raise DataError(f"{problem}; declare measured = true for at least one.")
     if not population.inputs:
         roles = [(c.name, c.role.value) for c in population.columns]
-        raise DataError(
-            f"No channel has the role 'input', found {roles}: models need what drives a machine; declare it."
-        )
+        reason = "models need what drives a machine"
+        raise DataError(f"No channel has the role 'input', found {roles}: {reason}; declare it.")
     recorded = {key.unit for key in population.episodes}
     units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
     if len(units) < 2 and not allow_single:

@@ -315,20 +315,19 @@ class Differentiate(Step):
         needs = f"a cutoff_hz above zero and below the Nyquist frequency of {bound:g} Hz, found {self.cutoff_hz}"
         self._require(0 < self.cutoff_hz < bound, needs)
         added = replace(scaling_of(signals.scaling, self.channel), column=None, offset="")
-        role, at = (Role.TRUTH, len(channels)) if self.of else (Role.STATE, _n_states(channels))
+        role, at = Role.TRUTH if self.of else Role.STATE, self._position(channels)
         channels = (*channels[:at], Channel(self.name, role, self.unit, of=self.of), *channels[at:])
         return replace(signals, channels=channels, scaling={**signals.scaling, self.name: added})
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with one more column."""
         smooth = lowpass(recording.values[:, self.columns(self.named, channels)], self.cutoff_hz * period_s)[:, 0]
-        at = len(channels) if self.of else _n_states(channels)
-        values = np.insert(recording.values, at, np.gradient(smooth, period_s), axis=1)
+        values = np.insert(recording.values, self._position(channels), np.gradient(smooth, period_s), axis=1)
         return replace(recording, values=values)
 
-
-def _n_states(channels: Channels) -> int:
-    return sum(c.role is Role.STATE for c in channels)
+    def _position(self, channels: Channels) -> int:
+        """Return where the new channel stands."""
+        return len(channels) if self.of else [c.role for c in channels].count(Role.STATE)
 
 
 def lowpass(values: Array, cutoff: float) -> Array:

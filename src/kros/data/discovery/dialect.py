@@ -7,6 +7,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -76,11 +77,9 @@ def encoding_of(content: bytes) -> str:
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     for name in ("utf-8", "cp1252"):
-        try:
+        with suppress(UnicodeDecodeError):
             codecs.getincrementaldecoder(name)().decode(content)  # the last character may be cut
             return name
-        except UnicodeDecodeError:
-            continue
     return "latin-1"
 
 

@@ -120,10 +120,8 @@ def as_numbers(values: Any) -> Array:
 def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
     """Yield every episode of a mapping from units, from units and conditions, or from keys."""
     if not isinstance(data, Mapping):
-        actual = f"found {shortened(repr(data))}"
-        raise DataError(
-            f"from_arrays needs a mapping from units to lists of episodes, {actual}; see its documentation."
-        )
+        needs = "needs a mapping from units to lists of episodes"
+        raise DataError(f"from_arrays {needs}, found {shortened(repr(data))}; see its documentation.")
     for unit, of_unit in data.items():
         if isinstance(unit, EpisodeKey):
             yield unit, of_unit
@@ -131,10 +129,8 @@ def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
         conditions = of_unit if isinstance(of_unit, Mapping) else {DEFAULT_CONDITION: of_unit}
         for condition, episodes in conditions.items():
             if isinstance(episodes, str | bytes | Mapping) or not isinstance(episodes, Iterable):
-                actual = f"found {shortened(repr(episodes))}"
-                raise DataError(
-                    f"from_arrays: unit {unit} ({condition}) needs a list of episodes, {actual}; correct it."
-                )
+                needs = f"unit {unit} ({condition}) needs a list of episodes"
+                raise DataError(f"from_arrays: {needs}, found {shortened(repr(episodes))}; correct it.")
             yield from ((EpisodeKey(str(unit), str(condition), str(i)), one) for i, one in enumerate(episodes))
 
 

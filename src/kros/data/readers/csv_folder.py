@@ -56,11 +56,6 @@ class ChannelMapping(Settings):
     offset: float = Field(0.0, description="added after scaling, as from degC to K, in the channel's unit")
     truth_of: str = Field("", alias="of", description="for the role `truth`: the state that it is the truth of")
 
-    @property
-    def declared(self) -> Channel:
-        """The channel of the population."""
-        return Channel(self.name, self.role, self.unit, self.measured, self.truth_of)
-
 
 class UnitMapping(Settings):
     """``[[unit]]``: one of several units in the same file."""
@@ -172,7 +167,7 @@ class CsvMapping(Settings):
     @property
     def channels(self) -> tuple[Channel, ...]:
         """The population's channels."""
-        return tuple(c.declared for c in self.ordered)
+        return tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in self.ordered)
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -230,8 +225,6 @@ def mapping_schema() -> dict[str, Any]:
 
 log = logging.getLogger(__name__)
 ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", *FORMATS)
-DEFAULT_UNIT = "unit"
-DEFAULT_EPISODE = "0"
 _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
 
 
@@ -335,7 +328,7 @@ def _episodes(
     """Yield the episodes of a file, of which its name says some parts."""
     places = [(unit.suffix, _place(path, fields, stated, mapping, unit)) for unit in mapping.units]
     for labels, number, rows in _stretches(path, fields, mapping):
-        parts = {"unit": DEFAULT_UNIT, "condition": DEFAULT_CONDITION, "episode": DEFAULT_EPISODE, **named, **labels}
+        parts = {"unit": "unit", "condition": DEFAULT_CONDITION, "episode": "0", **named, **labels}
         for suffix, place in places:
             for i in range(mapping.pieces):
                 episode = parts["episode"] + number + (f".{i + 1}" if mapping.pieces > 1 else "")

@@ -106,10 +106,7 @@ def read_blocks(
     timestamp: str | None = None,
     rows: float = np.inf,
 ) -> Iterator[Array]:
-    """Yield some columns of a table in blocks of at least `rows`, the last one apart, shape (n, len(wanted)).
-
-    With the order of a date in `timestamp` the first one holds timestamps, which become microseconds.
-    """
+    """Yield columns in blocks of `rows` or more, (n, len(wanted)); the first in us if `timestamp` orders its dates."""
     if is_binary(path):
         yield values_of(path, [fields[i] for i in wanted])
         return
@@ -233,9 +230,8 @@ def from_numpy(values: AnyArray) -> Any:
     """Return an Arrow array without nulls that shares the memory of contiguous numbers."""
     import pyarrow as pa
 
-    return pa.Array.from_buffers(
-        pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(np.ascontiguousarray(values))]
-    )
+    content = pa.py_buffer(np.ascontiguousarray(values))
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, content])
 
 
 def repeated(text: str, count: int) -> Any:

@@ -51,10 +51,6 @@ class Measure:
     factor: float
     offset: float
 
-    def into(self, other: Measure) -> tuple[float, float]:
-        """Return factor and offset from this unit to another one of the same quantity."""
-        return self.factor / other.factor, (self.offset - other.offset) / other.factor
-
 
 def bare(text: str) -> str:
     """Return a unit without brackets and spaces around it."""

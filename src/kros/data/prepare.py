@@ -14,16 +14,7 @@ from ..core.arrays import Array, frozen
 from ..core.artifacts import digest_of, united
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened, stamp_of
-from .population import (
-    Channel,
-    EpisodeKey,
-    Population,
-    Scalings,
-    Unit,
-    columns_in_order,
-    natural_key,
-    part_columns,
-)
+from .population import Channel, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key, part_columns
 from .recording import (
     Recording,
     Recordings,

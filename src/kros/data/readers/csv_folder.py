@@ -21,16 +21,7 @@ from ...core.errors import DataError
 from ...core.files import did_you_mean, read_toml
 from ...core.settings import Settings
 from ..measures import clean_unit, measure, split_header
-from ..population import (
-    DEFAULT_CONDITION,
-    Channel,
-    EpisodeKey,
-    Population,
-    Role,
-    Scaling,
-    Unit,
-    columns_in_order,
-)
+from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import STEPS, Scale, Step
@@ -193,11 +184,9 @@ class CsvMapping(Settings):
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""
         steps = [step.without(names) for step in parse_steps(self.prepare, "CSV mapping: prepare")]
-        remaining = {
-            "channel": tuple(c for c in self.channel if c.name not in names),
-            "prepare": tuple(step for step in steps if step is not None),
-        }
-        return self.model_copy(update=remaining)
+        channels = tuple(c for c in self.channel if c.name not in names)
+        prepare = tuple(step for step in steps if step is not None)
+        return self.model_copy(update={"channel": channels, "prepare": prepare})
 
 
 def _is_mark(text: str) -> bool:
@@ -417,7 +406,7 @@ def _conversion(path: Path, column: Column, declared: str, stated: str) -> tuple
     if ours is None or theirs is None or ours.si != theirs.si:
         problem = f"column {column!r} is in {stated!r}, and declared in {declared!r}"
         raise DataError(f"Reading {path}: {problem}; correct the file, or column_unit.")
-    return theirs.into(ours)
+    return theirs.factor / ours.factor, (theirs.offset - ours.offset) / ours.factor
 
 
 def _position(path: Path, fields: list[str], column: Column, unit: str = "") -> int:

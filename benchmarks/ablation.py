@@ -52,6 +52,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "start_gain = 0": {"start_gain": 0.0},
     "start not used": {"start_trust": (1e6,)},
     "nonlinear_trust = 0": {"nonlinear_trust": 0.0},
+    "gap_share = 0": {"gap_share": 0.0},
     "beyond = 0": {"beyond": 0.0},
     "penalties = [1e-16]": {"penalties": (1e-16,)},
     "parts = 1": {"parts": 1},

@@ -206,10 +206,7 @@ def scale_population(population: Population, sizes: Mapping[str, float]) -> Popu
 
 
 def recording_marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
-    """Return digests of all that the samples of every group follow from; None where the recordings are in no file.
-
-    These are its file, known by path, size and time, its place in the file, and how it is read and prepared.
-    """
+    """Return digests of all that the samples of every group follow from; None where the recordings are in no file."""
     read = source.recordings
     settings = [(f.name, getattr(read, f.name)) for f in fields(read) if f.name != "places"]
     about = (source.channels, source.period_s, source.steps, source.gaps)

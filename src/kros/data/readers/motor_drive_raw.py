@@ -93,11 +93,7 @@ def read_motor_drive_raw(source: Path | str) -> Population:
 
 
 def write_raw(population: Population, out: Path | str) -> None:
-    """Write recordings before preparation, in the reader's channels and units, as a folder that is whole or not there.
-
-    Targets are written one row later than the measurements that they belong to, so reading back gives one sample less
-    (and 1000 less at rest).
-    """
+    """Write recordings before preparation, in the channels and units of the reader, as a whole folder or none."""
     import pyarrow as pa
     from pyarrow import csv
 

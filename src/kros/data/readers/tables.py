@@ -106,10 +106,7 @@ def read_blocks(
     timestamp: str | None = None,
     rows: float = np.inf,
 ) -> Iterator[Array]:
-    """Yield some columns of a table in blocks of at least `rows`, the last one apart, shape (n, len(wanted)).
-
-    With the order of a date in `timestamp` the first one holds timestamps, which become microseconds.
-    """
+    """Yield some columns of a table in blocks of at least `rows`; the first may be timestamps, as microseconds."""
     if is_binary(path):
         yield values_of(path, [fields[i] for i in wanted])
         return

@@ -173,7 +173,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (len(bank.taps) - 2))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = samples([made], biased.bias)[0][0] - X
+    moved = samples([made], lambda y: y + 0.5)[0][0] - X
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
@@ -334,3 +334,17 @@ def test_values_of_the_first_sample_are_trusted_where_left_out_episodes_confirm_
         ]
         errors.append(np.sqrt(np.mean(np.square(off))))
     assert errors[1] < 0.8 * errors[0]
+
+
+def test_lost_measurements_cost_less_where_their_bridges_are_rows_of_the_regression(exact):
+    _, batches = exact
+    recordings = Recordings.of(list(batches), batches.__getitem__)
+    batch, errors = next(iter(batches.values())), []
+    lost = np.random.default_rng(1).random(len(batch.states)) < 0.3
+    y = np.where(lost[:, None, None] & (np.arange(len(lost)) > 0)[:, None, None], np.nan, batch.states[..., :1])
+    for share in (0.0, FEW.gap_share):
+        settings = FEW.model_copy(update={"gap_share": share})
+        observer = identify_estimator("plant", LIFTING, (0,), ("u",), recordings, DT, settings=settings).observer
+        off = run_observer(observer, y, batch.inputs)[:, 0, :3] - batch.states[:, 0]
+        errors.append(np.sqrt(np.mean(off**2, axis=0)) / np.abs(batch.states).max(axis=(0, 1)))
+    assert (errors[1][:2] < 0.4 * errors[0][:2]).all()  # the current follows from the input

@@ -197,7 +197,7 @@ def scale_population(population: Population, sizes: Mapping[str, float]) -> Popu
 
 
 def recording_marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
-    """Return digests of file (path, size, time), place, reading and preparation of every group; None without a file."""
+    """Return digests of all that the samples of every group follow from; None where the recordings are in no file."""
     read = source.recordings
     settings = [(f.name, getattr(read, f.name)) for f in fields(read) if f.name != "places"]
     about = (source.channels, source.period_s, source.steps, source.gaps)

@@ -1,7 +1,4 @@
-"""Columns of a table: units of measure, kinds of quantities, names of channels, and what they are likely to be.
-
-A column is time, a measured state, a hidden state, an input, or not needed.
-"""
+"""Columns of a table: units of measure, kinds of quantities, names of channels, and what they are likely to be."""
 
 from __future__ import annotations
 

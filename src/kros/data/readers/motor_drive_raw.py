@@ -93,7 +93,7 @@ def read_motor_drive_raw(source: Path | str) -> Population:
 
 
 def write_raw(population: Population, out: Path | str) -> None:
-    """Write raw recordings as a folder, whole or not at all; targets lag, so reading back gives `LAG` samples less."""
+    """Write recordings before preparation, in the channels and units of the reader, as a whole folder or none."""
     import pyarrow as pa
     from pyarrow import csv
 

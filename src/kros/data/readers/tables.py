@@ -106,7 +106,7 @@ def read_blocks(
     timestamp: str | None = None,
     rows: float = np.inf,
 ) -> Iterator[Array]:
-    """Yield columns in blocks of `rows` or more, (n, len(wanted)); the first in us if `timestamp` orders its dates."""
+    """Yield some columns of a table in blocks of at least `rows`; the first may be timestamps, as microseconds."""
     if is_binary(path):
         yield values_of(path, [fields[i] for i in wanted])
         return

@@ -30,6 +30,7 @@ from .settings import EstimatorSettings
 T = TypeVar("T", bound=Hashable)
 Read = Callable[[EpisodeKey], EpisodeBatch]
 Rows = tuple[EpisodeKey, Array, Array, Array]  # rows of the bank, targets and weights
+Shown = Callable[[Array], Array]  # from measurements (n_samples, q) to what the bank sees of them
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
 
 
@@ -123,6 +124,25 @@ def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[Who
         yield np.concatenate(parts), np.repeat([float(early), float(late)], [len(part) for part in parts])
 
 
+def interpolated(y: Array) -> Array:
+    """Return measurements (n_samples, q) with straight lines over those that are missing."""
+    if np.isfinite(y).all():
+        return y
+    filled = y.copy()
+    for column in filled.T:
+        there = np.isfinite(column)
+        if not there.any():
+            raise DataError("Estimator: no sample of a measurement arrives in a training episode; leave it out.")
+        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
+    return filled
+
+
+def bridged(y: Array) -> Array:
+    """Return measurements (n_samples, q) with straight lines over every other one, lost at random."""
+    lost = np.random.default_rng(0).random(len(y)) < 0.5
+    return interpolated(np.where(lost[:, None], np.nan, y))
+
+
 @frozen
 class Design:
     """A bank of channels with the recordings that it is fitted to: the rows of the regression."""
@@ -137,8 +157,8 @@ class Design:
         """Return the design with the bank of its channels."""
         return cls(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
 
-    def rows(self, recordings: Recordings, rows: int, offset: Array | float = 0.0) -> Iterator[Rows]:
-        """Yield episode, bank rows, targets and weights of every episode, with an offset of the measurements.
+    def rows(self, recordings: Recordings, rows: int, shown: Shown = interpolated) -> Iterator[Rows]:
+        """Yield episode, bank rows, targets and weights of every episode, with measurements as they are shown.
 
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
         """
@@ -146,17 +166,17 @@ class Design:
         samples = thinned(recordings.lengths, rows, first)
         measured = list(self.channels.measured)
         for key, (at, weights) in zip(recordings.keys, samples, strict=True):
-            states, y, v = self.episode(recordings.read(key), offset)
+            states, y, v = self.episode(recordings.read(key), shown)
             targets = states[at + 1] / recordings.size
             reference = v[at] @ self.channels.reference.T
             reference[:, self.channels.held] = y[at][:, self.channels.held]
             targets[:, measured] -= reference / recordings.size[measured]
             yield key, self.bank.rows(self.channels.filtered(v), at), targets, weights
 
-    def episode(self, batch: EpisodeBatch, offset: Array | float = 0.0) -> tuple[Array, Array, Array]:
-        """Return states, measurements with an offset, and channels of an episode, (n_samples, .)."""
+    def episode(self, batch: EpisodeBatch, shown: Shown = interpolated) -> tuple[Array, Array, Array]:
+        """Return states, measurements as they are shown, and channels of an episode, (n_samples, .)."""
         length, own = batch.lengths[0], {k: p[0] for k, p in batch.parameters.items()}
-        y = interpolated(batch.measurements(self.channels.measured)[:length, 0]) + offset
+        y = shown(batch.measurements(self.channels.measured)[:length, 0])
         return batch.states[:length, 0], y, self.channels.signals(y, batch.inputs[:length, 0], own)
 
     def signals(self, some: int, length: int) -> Array:
@@ -180,34 +200,21 @@ class Design:
 
 
 def in_step(
-    designs: Sequence[Design], recordings: Recordings, rows: int, offset: Array | float = 0.0
+    designs: Sequence[Design], recordings: Recordings, rows: int, shown: Shown = interpolated
 ) -> Iterator[tuple[Rows, ...]]:
     """Yield what `Design.rows` yields of several designs, episode by episode: each is read once."""
     once = replace(recordings, read=lru_cache(maxsize=1)(recordings.read))
-    return zip(*(design.rows(once, rows, offset) for design in designs), strict=True)
+    return zip(*(design.rows(once, rows, shown) for design in designs), strict=True)
 
 
-def samples(designs: Sequence[Design], offset: Array | float = 0.0) -> list[tuple[Array, Array]]:
-    """Return thinned rows of the bank of every design, with an offset of measurements, and weights that sum to one."""
+def samples(designs: Sequence[Design], shown: Shown = interpolated) -> list[tuple[Array, Array]]:
+    """Return thinned rows of the bank of every design, measurements as they are shown, and weights that sum to one."""
     recordings, settings = designs[0].recordings, designs[0].settings
-    episodes = list(in_step(designs, recordings.some(settings.episodes // 2), settings.sample, offset))
+    episodes = list(in_step(designs, recordings.some(settings.episodes // 2), settings.sample, shown))
     weights = np.concatenate([w for (*_, w), *_ in episodes])
     return [
         (np.vstack([rows for _, rows, *_ in of_one]), weights / weights.sum()) for of_one in zip(*episodes, strict=True)
     ]
-
-
-def interpolated(y: Array) -> Array:
-    """Return measurements (n_samples, q) with straight lines over those that are missing."""
-    if np.isfinite(y).all():
-        return y
-    filled = y.copy()
-    for column in filled.T:
-        there = np.isfinite(column)
-        if not there.any():
-            raise DataError("Estimator: no sample of a measurement arrives in a training episode; leave it out.")
-        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
-    return filled
 
 
 @frozen
@@ -227,8 +234,11 @@ class Whitening:
         scale = np.sqrt(weights)[:, None] / size
         bank, settings, bias = design.bank, design.settings, design.recordings.bias
         trust, start = (np.diag(bank.trust(*of)) for of in ((settings.nonlinear_trust, 0.0), (0.0, 1.0)))
+        errors = [] if design.channels.inputs_only else [(settings.gap_share, bridged)]
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
-            moved = (samples([design], bias)[0][0] - X) * scale
+            errors.append((1.0, lambda y: interpolated(y) + bias))
+        for share, shown in errors:
+            moved = (samples([design], shown)[0][0] - X) * scale * np.sqrt(share)
             trust = np.vstack([trust, qr_triangle(moved)])
         least = min(settings.start_trust) * start
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, least])))

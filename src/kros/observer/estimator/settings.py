@@ -69,6 +69,12 @@ class EstimatorSettings(Settings):
         lt=1,
         description="share by which the next one has to lessen errors, since machines start elsewhere too",
     )
+    gap_share: float = Field(
+        1e-3,
+        ge=0,
+        description="weight of the errors that straight lines over lost measurements make, half of them: rows with "
+        "target zero, which bound the gains of filters on smooth recordings",
+    )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"
     )

@@ -108,6 +108,17 @@ def test_a_repeated_last_stamp_drops_the_sample_and_uneven_time_names_the_file(t
         found.read(found.episodes[2])
 
 
+def test_a_last_sample_of_the_same_stamp_is_dropped_however_often_it_is_written(tmp_path: Path) -> None:
+    time, values = 0.01 * np.arange(100), np.random.default_rng(0).normal(size=(100, 3))
+    for more in (1, 2):
+        ends = np.vstack([values, *[values[-1:] + 1] * more])
+        written(tmp_path, f"a_{more}.csv", np.append(time, [time[-1]] * more), ends)
+    found = read_csv_folder(tmp_path, MAPPING)
+    for key in found.episodes:
+        np.testing.assert_allclose(found.read(key), values, rtol=1e-12)
+        np.testing.assert_allclose(np.vstack(list(found.blocks(key, 30))), values, rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["population", "outliers"])
 def test_folders_of_these_names_are_no_proof_of_the_raw_layout(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()

@@ -56,12 +56,12 @@ class Recording:
         time = None if self.time_s is None else self.time_s[start:stop]
         return replace(self, values=self.values[start:stop], time_s=time)
 
-    def distinct(self, last: bool = False) -> Recording:
-        """Return the same without samples that repeat time and all values of those before, or time alone at the end."""
+    def distinct(self) -> Recording:
+        """Return the same without samples that repeat time and all values of those before, as late loggers write."""
         if self.time_s is None:
             return self
-        again, end = 1 + np.flatnonzero(np.diff(self.time_s) == 0), len(self.values) - 1 if last else -1
-        drop = [k for k in again if k == end or np.array_equal(self.values[k], self.values[k - 1], equal_nan=True)]
+        again = 1 + np.flatnonzero(np.diff(self.time_s) == 0)
+        drop = [k for k in again if np.array_equal(self.values[k], self.values[k - 1], equal_nan=True)]
         return replace(self, values=np.delete(self.values, drop, axis=0), time_s=np.delete(self.time_s, drop))
 
     def usable(self, period_s: float) -> Recording:
@@ -70,6 +70,12 @@ class Recording:
         even = np.arange(len(self.values), dtype=np.float64) * period_s
         time = even if self.time_s is None else self.time_s
         return replace(self, values=self.values[usable_rows], time_s=time[usable_rows])
+
+    def ended(self) -> Recording:
+        """Return the same without a last sample that repeats the stamp before it, as stopped recorders write."""
+        time = self.time_s
+        repeated = time is not None and len(time) > 1 and time[-1] == time[-2]
+        return self.cut(0, len(self.values) - 1) if repeated else self
 
 
 @frozen
@@ -87,7 +93,7 @@ class Recordings:
         if key not in self.places:
             others = f"this source has {len(self.places)} other episodes"
             raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
-        return self.read(key, self.places[key]).distinct(last=True)
+        return self.read(key, self.places[key]).distinct().ended()
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
         """Yield one episode in blocks of about `rows` samples where the format can, else whole."""

@@ -260,7 +260,7 @@ class CsvRecordings(Recordings):
             first = first if first.size else values[:1]
             joined, n, last = np.vstack([last, values]), len(last), values[-1:]
             waiting = [self._recording(key, joined, first).distinct().cut(n, len(joined))]
-        yield waiting[0].distinct(last=True)
+        yield waiting[0].ended()
 
     def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
         """Yield the columns of a file in blocks, in the units of measure that are declared."""

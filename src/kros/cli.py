@@ -419,7 +419,7 @@ def schema() -> None:
 
 @app.command()
 def doctor() -> None:
-    """Print versions, solvers and what is missing."""
+    """Print versions, the compiler and what is missing."""
     from .study.commands.summary import diagnose
 
     _say(diagnose())

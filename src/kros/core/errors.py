@@ -1,8 +1,8 @@
 """Errors of kros.
 
 Every message says what was asked, what was found (unit, episode, channel, value) and what to do next. The command line
-maps `DataError`, `ConfigError` and `DimensionError` to exit code 2 while nothing has been computed, and everything else
-to 1.
+maps `DataError`, `ConfigError`, `DimensionError` and `MissingDependencyError` to exit code 2 while nothing has been
+computed, and everything else to 1.
 """
 
 

@@ -47,7 +47,7 @@ class Published(Mixed):
     max_order: int = 4  # of the weight of an entry
 
     def design(self, task: DesignTask) -> Design:
-        """Solve the published problem; its weights bound entries, not a full perturbation, so nothing is certified."""
+        """Solve the published problem; its weights bound entries: its own norms are none of the set."""
         weights = self.weights(task)
         solved = synthesis.mixed(as_published(task.require_problem(), weights.system), steps=self.steps)
         note = f"The weights bound entries: a full perturbation exceeds them {weights.excess:.3g} times."

@@ -65,7 +65,7 @@ def models(facts: Facts) -> Section | None:
     text += f" Koopman models have lifted functions as well: {', '.join(functions)}." if functions else ""
     if any(not name.endswith("_edmd") for name in entries):
         text += " Refined models minimise the simulation error, regularised towards the population mean; the strength "
-        text += "is chosen by cross-validation."
+        text += "is chosen on the last training episode of every unit."
     errors = {name: entry.get("freerun_error_percent", {}) for name, entry in entries.items()}
     columns = [
         Column("model", [model_label(name) for name in entries]),

@@ -12,6 +12,7 @@ from typing import Any
 from ...core.artifacts import load_artifact
 from ...core.errors import ConfigError
 from ...core.files import write_bytes
+from ...loops.compiler import COMPILERS
 from ...report.compare import comparison, lines, sections
 from ...report.content import Column, Section, build
 from ...report.error_tables import ErrorCell
@@ -37,8 +38,8 @@ def diagnose() -> list[str]:
     rows = [f"kros {_version('kros', 'not installed as a package')}   {system}"]
     rows += [f"  {name:<16} {_version(name, 'MISSING: install kros again')}" for name in _REQUIRED]
     rows += ["optional", *(f"  {name:<16} {_version(name, 'not installed')}   {of}" for name, of in _OPTIONAL.items())]
-    compiler = shutil.which("cc") or shutil.which("gcc") or "none"
-    return [*rows, f"C compiler        {compiler}   for checking exported C code"]
+    compiler = next(filter(None, map(shutil.which, COMPILERS)), "none")
+    return [*rows, f"C compiler        {compiler}   for batch runs, and for checking exported C code"]
 
 
 def _version(name: str, otherwise: str) -> str:

@@ -199,7 +199,7 @@ class ObserverProblem:
 
     @property
     def remainder(self) -> tuple[StateSpace, StateSpace] | None:
-        """Weights of the additive remainder: of what it does, and of what it sees of white inputs."""
+        """Weights of the additive remainder, for what it does and for what it sees of white inputs."""
         left, right = self.remainder_left, self.remainder_right
         return None if left is None or right is None else (left, right @ self.input_weight)
 

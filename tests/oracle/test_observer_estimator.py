@@ -348,3 +348,18 @@ def test_lost_measurements_cost_less_where_their_bridges_are_rows_of_the_regress
         off = run_observer(observer, y, batch.inputs)[:, 0, :3] - batch.states[:, 0]
         errors.append(np.sqrt(np.mean(off**2, axis=0)) / np.abs(batch.states).max(axis=(0, 1)))
     assert (errors[1][:2] < 0.4 * errors[0][:2]).all()  # the current follows from the input
+
+
+def test_trust_in_the_start_ignores_groups_in_which_a_state_rests():
+    recordings, _ = plant(units=3, episodes=3, spread=0.1)
+    settings = FEW.model_copy(update={"parts": 3, "penalties": (1e-8,), "start_trust": (1.0, 0.1)})
+    made = design(recordings, settings=settings)
+    (moments,) = Moments.of([made], [Whitening.of(made, samples([made])[0])])
+    parts = moments.of_groups("part")
+    errors = np.zeros((len(parts), 2, 3))
+    errors[:, 1] = 0.1  # the smaller error is no better
+    errors[parts < 2, 1, 0] = -60.0  # but where the first state is zero
+    resting = replace(moments, power=np.where((parts < 2)[:, None] & (np.arange(3) == 0), 0.0, 1.0))
+    np.testing.assert_array_equal(resting.best(errors, settings), [0, 0, 0])
+    errors[:, 1] = -0.3  # fourteen percent less, everywhere
+    np.testing.assert_array_equal(resting.best(errors, settings), [1, 1, 1])

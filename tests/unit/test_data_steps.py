@@ -8,6 +8,7 @@ import pytest
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, from_frame, prepare, steps
 from kros.data.prepare import parse_steps, with_gaps
+from kros.data.recording import NonFiniteError
 from kros.data.steps import Resample, lowpass
 
 KEY = EpisodeKey("a", "default", "0")
@@ -124,6 +125,9 @@ def test_resample_bridges_samples_that_hold_nan_but_not_those_that_may_be_missin
     holes = prepare(from_arrays({KEY: values}, CHANNELS, 0.01), [steps.Resample(0.01)])
     np.testing.assert_allclose(holes.read(KEY)[:, 0], np.sin(time), atol=1e-4)
     assert np.isnan(with_gaps(holes).read(KEY)[7, 0])
+    values[:, 1] = np.nan
+    with pytest.raises(NonFiniteError, match="NaN"):  # nothing to bridge: on_nan = "drop_episode" finds it
+        prepare(from_arrays({KEY: values}, CHANNELS, 0.01), [steps.Resample(0.01)]).read(KEY)
 
 
 def test_resample_takes_the_longest_stretch_without_gaps_and_refuses_time_that_runs_backwards() -> None:

@@ -58,6 +58,7 @@ class PreparedSource:
     def _prepared(self, recording: Recording) -> tuple[Array, tuple[Channel, ...]]:
         """Return what steps make of an episode, or of a part of it, and the channels."""
         signals = Signals(self.channels, self.period_s)
+        # A running observer has to see that a sample is missing; training does not.
         if not self.gaps and any(step.makes_even for step in self.steps):
             recording = recording.usable(self.period_s)
         for step in self.steps:

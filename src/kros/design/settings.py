@@ -11,7 +11,7 @@ from ..observer.baselines.trained import Regressor
 from .baselines import BASELINES
 from .methods import METHODS
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the names are those of the registries, which a type checker does not know
     MethodName = str
     BaselineName = str
 else:

@@ -21,6 +21,7 @@ from .truth import TrueErrors, true_errors
 
 Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
 SIDE_BY_SIDE = 16  # episodes
+_TOGETHER = 8  # observers, at most
 _NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again
 
 
@@ -40,7 +41,7 @@ def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
     groups: dict[Any, list[Observer]] = {}
     for o in observers:
         groups.setdefault((o.lifting, tuple(o.parameters.items()), o.measured, o.inputs), []).append(o)
-    return [g[start : start + 8] for g in groups.values() for start in range(0, len(g), 8)]
+    return [g[start : start + _TOGETHER] for g in groups.values() for start in range(0, len(g), _TOGETHER)]
 
 
 @frozen

@@ -37,7 +37,7 @@ def delay_samples(signals: Array, truths: Array) -> Array:
     from scipy.signal import fftconvolve
 
     n = len(signals)
-    most = min(200, n // 4)
+    most = min(200, n // 4)  # samples
     if most < 1:
         return np.full(signals.shape[1:], np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):

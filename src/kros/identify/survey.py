@@ -158,10 +158,11 @@ def survey(
     tasks = [_Group(population.select([u], [c]), folder, chosen.on_nan) for u, c, _ in population.groups()]
     keys = (keys for _, _, keys in population.groups())
     marks = recording_marks(population.source, keys, chosen.on_nan, folder is None)
-    recalled = (work or Work()).recall(
-        "read", _read_group, tasks, marks, _GroupFacts, lambda _, known: copy is None or copy.reuse(known)
+    groups = list(
+        (work or Work()).recall(
+            "read", _read_group, tasks, marks, _GroupFacts, lambda _, known: copy is None or copy.reuse(known)
+        )
     )
-    groups = list(recalled)
     retained = _retained(population, groups, folder)
     facts = _facts(population, retained, groups, chosen)
     for alert in facts.alerts:

@@ -236,7 +236,7 @@ def _examined(
         why = f"{looks[0].key}: {looks[0].wrong or looks[0].nan}"
         raise DataError(f"Looking at {source}: none of {len(looks)} episodes can be used; {why}.")
     findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]
-    findings += [] if bridged else [s.nan for s in nan]
+    findings += [s.nan for s in nan if not bridged]
     few = [group for group, n in counts.items() if n < 2]
     if 2 * len(few) > len(counts) and min(s.n_samples for s in good) >= RULE.pieces * RULE.shortest_piece:
         mapping = mapping | {"pieces": RULE.pieces}
@@ -249,9 +249,7 @@ def _examined(
     retained = read_csv_folder(source, mapping)
     prepare, text = _resampling(population, source, good, bridged)
     reading = _reading(retained, source)
-    return Discovery(
-        mapping, prepare, draft.columns, retained, notes, (*findings, *text), bool(nan) and not bridged, reading
-    )
+    return Discovery(mapping, prepare, draft.columns, retained, notes, (*findings, *text), len(nan) > bridged, reading)
 
 
 def _resampling(

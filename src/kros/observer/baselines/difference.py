@@ -57,7 +57,7 @@ def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, i
         pairs = product(rates(y, cutoff, dt)[inside].T, states)
         share = np.maximum(share, np.reshape([_explained(*pair) for pair in pairs], share.shape))
     share[:, list(measured)] = 0.0
-    best = [(i, int(j)) for i, j in enumerate(share.argmax(axis=1)) if share[i, j] > 0.5]
+    best = [(i, int(j)) for i, j in enumerate(share.argmax(axis=1)) if share[i, j] > 0.5]  # explains most
     return tuple((i, j) for i, j in best if share[:, j].argmax() == i)
 
 

@@ -138,7 +138,7 @@ def interpolated(y: Array) -> Array:
 
 
 def bridged(y: Array) -> Array:
-    """Return measurements (n_samples, q) with straight lines over every other one, lost at random."""
+    """Return measurements (n_samples, q) with straight lines over half of the samples, lost at random."""
     lost = np.random.default_rng(0).random(len(y)) < 0.5
     return interpolated(np.where(lost[:, None], np.nan, y))
 
@@ -230,9 +230,9 @@ class Whitening:
     def of(cls, design: Design, sample: tuple[Array, Array]) -> Whitening:
         """Find the directions from thinned rows, with their weights."""
         X, weights = sample
-        size = design.bank.sizes(np.sqrt(weights @ (X * X)))
-        scale = np.sqrt(weights)[:, None] / size
         bank, settings, bias = design.bank, design.settings, design.recordings.bias
+        size = bank.sizes(np.sqrt(weights @ (X * X)))
+        scale = np.sqrt(weights)[:, None] / size
         trust, start = (np.diag(bank.trust(*of)) for of in ((settings.nonlinear_trust, 0.0), (0.0, 1.0)))
         errors = [] if design.channels.inputs_only else [(settings.gap_share, bridged)]
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
@@ -257,7 +257,7 @@ class Moments:
     gram: Array  # (groups, r, r)
     cross: Array  # (groups, r, n)
     power: Array  # (groups, n)
-    rows: Array  # (groups,)
+    rows: Array  # (groups,), how many there are
 
     @classmethod
     def of(cls, designs: Sequence[Design], whitenings: Sequence[Whitening]) -> list[Moments]:
@@ -303,20 +303,22 @@ class Moments:
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
-    def best(self, errors: Array, starts: int, settings: EstimatorSettings) -> Whole:
+    def best(self, errors: Array, settings: EstimatorSettings) -> Whole:
         """Return the best candidate of every state by logarithms of errors (groups, candidates, n) on what is left out.
 
         Of relative errors of the start, a later one is taken if it gains enough over parts, by the margin: episodes
         that start at other places have to confirm it.
         """
-        gain = -2 * np.log1p(-settings.start_gain)
+        starts, gain = errors.shape[1] // len(settings.penalties), -2 * np.log1p(-settings.start_gain)
         # A state at zero throughout a group would ask for no estimate of it at all.
         counted = (self.power > 0)[:, None]
-        mean = errors.mean(axis=0, where=counted | ~counted.any(axis=0))
+        counted |= ~counted.any(axis=0)
+        mean = errors.mean(axis=0, where=counted)
+        errors = np.where(counted, errors, mean)
         best = mean[::starts].argmin(axis=0) * starts
         for i, state in np.ndindex(starts, len(best)):
             other = mean[i::starts, state].argmin() * starts + i
-            one, before = (by("part", self.groups, errors[:, c, state]) for c in (other, best[state]))
+            one, before = (mean_by("part", self.groups, errors[:, c, state]) for c in (other, best[state]))
             best[state] = other if is_less(one + gain, before, settings.margin) else best[state]
         return best
 
@@ -362,7 +364,7 @@ class Readout:
         others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         errors = np.array(left_out)
-        best = moments.best(np.log(errors), len(candidates) // len(settings.penalties), settings)
+        best = moments.best(np.log(errors), settings)
         n = np.arange(errors.shape[2])
         coefficients = np.array(list(moments.solved(weights, candidates)))[best, :, n].T
         return cls(
@@ -393,7 +395,7 @@ class Readout:
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
-        return by("fold", list(self.others), np.log(self.left_out[:, list(states)]).mean(axis=1))
+        return mean_by("fold", list(self.others), np.log(self.left_out[:, list(states)]).mean(axis=1))
 
     def episode_errors(self) -> Array:
         """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
@@ -408,7 +410,7 @@ def spread(items: Sequence[T], count: int) -> list[T]:
     return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
 
 
-def by(what: str, groups: Sequence[Group], values: Array) -> Array:
+def mean_by(what: str, groups: Sequence[Group], values: Array) -> Array:
     """Return means of values of groups over every fold, or part, shape (folds,)."""
     names = np.array([getattr(group, what) for group in groups])
     return np.array([values[names == name].mean() for name in np.unique(names)])

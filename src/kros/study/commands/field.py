@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 Estimated = tuple[EpisodeKey, int, Array, Bits, Array]
 DEPLOYED = ("observers", "deployed.json")
 _BLOCK = 20_000  # samples of an episode that are run at once
+_PHASES = 24  # values that are tried, around the circle
 _BATCH = 20  # shorter episodes that run side by side
 
 
@@ -178,9 +179,9 @@ class FieldRecordings:
             if sum(map(len, chosen.values())) < _BLOCK:
                 chosen[key] = next(self.population.blocks(key, _BLOCK))
         arrived = arriving(self.observer, self.population, chosen, {unit: values})
-        step, known = 2 * np.pi / 24, {**self.observer.parameters, **values}
+        step, known = 2 * np.pi / _PHASES, {**self.observer.parameters, **values}
         signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
-        coarse = least_innovation(*signals, np.arange(24) * step)
+        coarse = least_innovation(*signals, np.arange(_PHASES) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
     @cached_property

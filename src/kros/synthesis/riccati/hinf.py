@@ -108,7 +108,7 @@ def _search(frame: Frame, idle: _Loop, tolerance: float, negligible: float) -> t
     best, proven = idle, frequency_bound(frame.scaled)
     lower = low = proven
     level, high = max(2 * proven, 1.0), best.norm
-    for _ in range(60):
+    for _ in range(60):  # bisections, at most
         if best.norm <= max(lower * (1 + tolerance), negligible) or high <= low * (1 + tolerance / 8):
             break
         if np.isfinite(high):

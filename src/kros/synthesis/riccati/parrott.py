@@ -28,7 +28,7 @@ def frequency_bound(p: GeneralizedPlant) -> float:
         free = null_space(D_y)
         best = max(best, float(np.linalg.norm(D @ free, 2)) if D.size and free.size else 0.0)
         points = _grid(A, p.dt) if len(A) and D.size else np.zeros(0)
-        for _ in range(5 if points.size else 0):
+        for _ in range(5 if points.size else 0):  # rounds; the bound is proven after any of them
             bounds = _bounds(side, points, p.dt)
             k = int(np.argmax(bounds))
             best = max(best, float(bounds[k]))

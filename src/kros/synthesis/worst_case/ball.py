@@ -147,7 +147,7 @@ def _descended(c: AnyArray, d: AnyArray, g: AnyArray, multipliers: AnyArray) -> 
     c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
     c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
     rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)
-    for _ in range(10):
+    for _ in range(10):  # sweeps
         rows = _best_rows(c, columns - d)
         columns = _best_rows(c_columns, rows - d_columns)
     return np.moveaxis(rows, 0, -1), np.moveaxis(columns, 0, -1)
@@ -158,7 +158,7 @@ def _best_rows(c: AnyArray, shift: AnyArray) -> AnyArray:
     least = np.maximum(np.max(-shift, axis=1), 0.0)
     gap = least[:, None] + shift
     x = np.maximum(np.max(np.sqrt(c) - gap, axis=1), 0.0)
-    for _ in range(4):
+    for _ in range(4):  # steps
         inverse = 1 / np.maximum(x[:, None] + gap, _SMALL)
         terms = c * inverse * inverse
         h = np.maximum(terms.sum(axis=1), TINY)

@@ -127,7 +127,7 @@ def circle_mean(density: Callable[[AnyArray], AnyArray], centers: AnyArray, rtol
     edges = _edges(centers)
     panels = _panels(density, edges[:-1], edges[1:])
     while (error := panels[3].sum()) > rtol * (total := panels[2].sum()):
-        if len(panels.T) > 4000:
+        if len(panels.T) > 4000:  # at most
             text = f"relative error {error / total:.2g} after {len(panels.T)} panels, above {rtol:.2g}"
             raise SynthesisError(f"Integrating the density: {text}; poles are extremely close to the unit circle.")
         split = panels[3] > min(0.5 * panels[3].max(), rtol * total / len(panels.T))

@@ -39,7 +39,7 @@ def design_grid(problem: ObserverProblem) -> AnyArray:
     dt = problem.nominal.dt
     systems = [problem.nominal, problem.W_L, problem.W_R, problem.input_weight]
     slowest = np.abs(np.concatenate([s.poles() for s in systems]) - 1).min(initial=1.0)
-    return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, 400) / (2 * np.pi * dt)
+    return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, 400) / (2 * np.pi * dt)  # 400 points
 
 
 def _remainder(problem: ObserverProblem, freqs_hz: AnyArray) -> AnyArray | None:

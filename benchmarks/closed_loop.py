@@ -1,4 +1,4 @@
-"""`examples/closed_loop` on random controllers: none is called safe that diverges, and few are undecided.
+"""`kros loop` on random controllers: none is called safe that diverges, and few are undecided.
 
 python benchmarks/closed_loop.py RUN [--controllers 200]: draws controllers over the observers of a run, and simulates what is
 called safe: every unit's nonlinear model with the observer as it is deployed on other episodes than those of the verdict,
@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import collections
 import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,18 +18,14 @@ import numpy as np
 
 from kros.core import StateSpace, block_diagonal, hinf_norm
 from kros.data import EpisodeBatch
+from kros.evaluate.closed_loop import Controller, close_loop
+from kros.evaluate.closed_loop.linear_loop import LinearLoop
+from kros.evaluate.closed_loop.simulated_loop import diverging
 from kros.observer import Observer
 from kros.synthesis.problem.interconnect import interconnect
 from kros.uncertainty.quantify import UncertainModels
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "closed_loop"))
-
-from controller import Controller
-from linear_loop import LinearLoop
-from loop import close_loop
-from simulated_loop import diverging
-
-VERDICT, SAMPLES, MEMBERS = 1000, 5000, 20
+VERDICT, SAMPLES, MEMBERS, LARGEST = 1000, 5000, 20, 100.0
 
 
 def drawn(rng: np.random.Generator, models: object) -> Controller:
@@ -51,7 +46,7 @@ def drawn(rng: np.random.Generator, models: object) -> Controller:
 
 def unstable_members(rng: np.random.Generator, loop: LinearLoop) -> int:
     """Return how many random members of the set, filters of gain one around the loop, are not stable."""
-    blocks, count = loop.blocks(), 0
+    blocks, count = loop.perturbed(), 0
     (w, z), (r, e), dt = np.sum(blocks.sizes[:-1], axis=0), blocks.sizes[-1], blocks.system.dt
     wires = {"Delta": {"M": np.eye(z, z + e)}, "M": {"Delta": np.eye(w + r, w), "r": np.eye(w + r, r, -w)}}
     for _ in range(MEMBERS):
@@ -82,12 +77,12 @@ def campaign(run: Path, controllers: int, seed: int = 0) -> dict:
         models, uncertain = found.models.models(kind), found.sets[kind]
         controller = drawn(rng, models)
         result = close_loop(observer, found, controller, VERDICT)
-        counts[name][result.status.value] += 1
-        if result.safe:
-            K = controller.placed(observer, models)
+        counts[name][result.status] += 1
+        if result.status == "SAFE":
+            K = controller.between(observer, models)
             last = [found.models.facts.keys("train", unit, models.condition)[-1] for unit in uncertain.unit_ids]
             batch = EpisodeBatch.read(found.models.population, last, SAMPLES)
-            units = diverging(observer, models, batch, controller)
+            units = diverging(observer, models, batch, controller, LARGEST)
             members = unstable_members(rng, LinearLoop.of(observer, models, uncertain, K)[0])
             if units or members:
                 wrong.append([name, controller.model_dump(), units, members])

@@ -13,6 +13,7 @@ from typing import Any
 
 from campaign import LONGEST_S, RESULTS
 
+SHORT = {"refused with a reason": "refused", ", resumed to the same bytes": "", "H-infinity optimum, ": ""}
 PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
 INTRODUCTION = f"""# Reliability
 
@@ -24,7 +25,8 @@ $ python benchmarks/reliability/formulas.py --seed 1
 
 Each campaign runs kros on random, damaged or adversarial inputs and compares the results with an independent truth. A
 case fails if a bound is false, if an exception other than those of kros occurs, or if a change of the input remains
-unreported. A case that takes longer than {LONGEST_S:g} s fails, too. `benchmarks/reliability/page.py` generates this page
+unreported. A case that takes longer than {LONGEST_S:g} s fails, too. *Refused* means with a reason; runs that are
+killed are resumed to the same bytes. `benchmarks/reliability/page.py` generates this page
 from `benchmarks/reliability/results`, where notes on single rows are.
 
 """
@@ -58,7 +60,10 @@ def _campaign(name: str, result: dict[str, Any]) -> str:
 
 def _row(tally: dict[str, Any]) -> str:
     cells = [tally["cases"], str(tally["tried"]), _counts(tally["outcomes"]), _counts(tally["failures"])]
-    return f"| {' | '.join(cells)} |\n"
+    row = f"| {' | '.join(cells)} |\n"
+    for long, short in SHORT.items():
+        row = row.replace(long, short)
+    return row
 
 
 def _counts(counts: dict[str, int]) -> str:

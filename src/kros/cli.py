@@ -311,6 +311,22 @@ def check(
 
 
 @app.command()
+def loop(
+    run_folder: Run,
+    controller: Annotated[Path, _option("State space from estimates to inputs, JSON.", "--controller", metavar="FILE")],
+    observer: ObserverName = "deployed",
+    quiet: Quiet = False,
+) -> None:
+    """Judge a controller that uses the estimates: SAFE, NOT SAFE (exit code 3) or UNDECIDED (4), with its margin."""
+    from .core.artifacts import plain
+    from .study.commands.loop import judge_controller
+
+    result = judge_controller(run_folder, controller, observer)
+    _show(quiet, plain(vars(result)), result.lines())
+    raise typer.Exit({"SAFE": 0, "UNDECIDED": UNDECIDED}.get(result.status, NOT_MET))
+
+
+@app.command()
 def watch(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where recordings arrive.")],
     run_folder: Run,

@@ -269,7 +269,9 @@ def certificates(facts: Facts) -> list[str]:
 
 def voids(facts: Facts) -> list[str]:
     """Return when the certificates of the deployed observer do not hold, the most frequent mistake first."""
-    texts = ["A controller uses the estimate: the recordings did not depend on it."]
+    texts = [
+        "A controller uses the estimate, on which recordings did not depend: kros loop gives the margin of the loop."
+    ]
     if facts.entry.get("set_certified") or facts.entry.get("worst_case_h2") is not None:
         texts += ["The motion differs from the recorded one, or leaves the range of training."]
         texts += ["The unit is worn, badly assembled, or of another batch."]

@@ -300,8 +300,6 @@ class ObserverProblem:
         """
         A, B, C, W_p = self.scaled
         n, m, q, eye, dt = len(A), B.shape[1], len(C), np.eye, self.nominal.dt
-        sizes = np.concatenate([self.noise, self.output_scale, self.input_scale])
-        filters = _scaled(estimate, 1 / self.output_scale, sizes)
         truth = np.vstack([C, eye(n), np.zeros((m, n))])
         columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
         plant = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt)
@@ -310,7 +308,12 @@ class ObserverProblem:
             "F": {"plant": truth, "r": truth} | columns,
         }
         inputs, outputs = {"d": m, "r": n, "n": q, "v": n, "s": m}, {"z": {"plant": W_p, "r": W_p, "F": -W_p}}
-        return interconnect({"plant": plant, "F": filters}, wires, inputs, outputs)
+        return interconnect({"plant": plant, "F": self.scaled_estimate(estimate)}, wires, inputs, outputs)
+
+    def scaled_estimate(self, estimate: StateSpace) -> StateSpace:
+        """Turn an estimate of all states from measurements, states and inputs into scaled coordinates."""
+        sizes = np.concatenate([self.noise, self.output_scale, self.input_scale])
+        return _scaled(estimate, 1 / self.output_scale, sizes)
 
     @property
     def _scales(self) -> tuple[AnyArray, AnyArray]:

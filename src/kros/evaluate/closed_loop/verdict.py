@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any
 
-from controller import Controller
-from linear_loop import LinearLoop
-from simulated_loop import DEFAULT, diverging
-from small_gain import peak, worst_gain
+import numpy as np
 
-from kros.core.errors import SynthesisError
-from kros.core.norms import hinf_norm
-from kros.data import EpisodeBatch
-from kros.observer import Observer
-from kros.uncertainty.quantify import UncertainModels
+from ...core.errors import SynthesisError
+from ...core.norms import hinf_norm
+from ...data import EpisodeBatch
+from ...observer import Observer
+from ...uncertainty.quantify import UncertainModels
+from .controller import Controller
+from .linear_loop import LinearLoop
+from .simulated_loop import diverging
+from .small_gain import attained, least_level
 
 ASSUMPTIONS = (
     "for margin, gain and spectral radius the loop is linear: functions are those of the plant, nothing saturates",
@@ -30,28 +30,17 @@ ASSUMPTIONS = (
 )
 
 
-class LoopStatus(StrEnum):
-    """Verdict on a loop.
+@dataclass(frozen=True)
+class LoopResult:
+    """What is known about a loop; None is not known.
 
-    SAFE
-        Stability is proven for the whole set, and no unit diverges in simulation.
-    NOT_SAFE
-        The loop of a unit, or of a member of the set, is not stable.
-    UNDECIDED
-        There is no linear analysis, or its bounds are on both sides of the set.
+    SAFE: stability is proven for the whole set, and no unit diverges in simulation. NOT SAFE: the loop of a unit, or of
+    a member of the set, is not stable. UNDECIDED: there is no linear analysis, or its bounds are on both sides of the
+    set.
 
     """
 
-    SAFE = "SAFE"
-    NOT_SAFE = "NOT SAFE"
-    UNDECIDED = "UNDECIDED"
-
-
-@dataclass(frozen=True)
-class LoopResult:
-    """What is known about a loop; None is not known."""
-
-    status: LoopStatus
+    status: str
     reasons: tuple[str, ...] = ()  # of a verdict that is not SAFE
     margin: float | None = None  # largest scaling of the set for which stability is proven
     destabilising: float | None = None  # smallest scaling for which a perturbation was found that destabilises
@@ -61,11 +50,6 @@ class LoopResult:
     error_gain: float | None = None  # proven largest gain from command to error over the set, signals in ranges
     nominal_gain: float | None = None  # that of the nominal unit
     assumptions: tuple[str, ...] = ASSUMPTIONS
-
-    @property
-    def safe(self) -> bool:
-        """Whether stability is proven for the whole set, and no unit diverges."""
-        return self.status is LoopStatus.SAFE
 
     def lines(self) -> list[str]:
         """Return what people read."""
@@ -82,7 +66,14 @@ class LoopResult:
         return [*lines, *(f"  assumed: {text}" for text in self.assumptions)]
 
 
-def close_loop(observer: Observer, uncertain: UncertainModels, controller: Any, samples: int = 5000) -> LoopResult:
+def close_loop(
+    observer: Observer,
+    uncertain: UncertainModels,
+    controller: Any,
+    samples: int = 5000,
+    largest: float = 100.0,
+    tolerance: float = 0.01,
+) -> LoopResult:
     """Judge the loop of a controller that uses an observer's estimates, on all units and on the uncertain set.
 
     Parameters
@@ -94,7 +85,11 @@ def close_loop(observer: Observer, uncertain: UncertainModels, controller: Any, 
     controller : Controller or control.StateSpace
         From estimated states to inputs, by name, in the units of the recordings.
     samples : int
-        At most, of a simulation.
+        Of a simulation, at most.
+    largest : float
+        In ranges: a state beyond has diverged.
+    tolerance : float
+        Relative width of the searches for margin and gain.
 
     Returns
     -------
@@ -113,35 +108,38 @@ def close_loop(observer: Observer, uncertain: UncertainModels, controller: Any, 
     models, covered, facts = uncertain.models.models(kind), uncertain.sets[kind], uncertain.models.facts
     first = [facts.keys("test", unit, models.condition)[0] for unit in covered.unit_ids]
     batch = EpisodeBatch.read(uncertain.models.population, first, samples)
-    diverged = diverging(observer, models, batch, controller)
-    reasons, known = list[str](), dict[str, Any](diverged=diverged)
-    if diverged:
-        reasons.append(f"it diverges in simulation with {', '.join(diverged)}")
+    diverged = diverging(observer, models, batch, controller, largest)
+    reasons, known = [f"it diverges in simulation with {', '.join(diverged)}"] * bool(diverged), dict[str, Any]()
     try:
-        loop, left_out = LinearLoop.of(observer, models, covered, controller.placed(observer, models))
+        loop, left_out = LinearLoop.of(observer, models, covered, controller.between(observer, models))
     except SynthesisError as error:
-        reasons.append(f"there is no linear analysis: {error}")
-        return LoopResult(LoopStatus.NOT_SAFE if diverged else LoopStatus.UNDECIDED, tuple(reasons), **known)
+        known["status"] = "NOT SAFE" if diverged else "UNDECIDED"
+        return LoopResult(reasons=(*reasons, f"there is no linear analysis: {error}"), diverged=diverged, **known)
     if left_out:
         known["assumptions"] = (*ASSUMPTIONS, f"the linear estimator does without {', '.join(left_out)}")
-    known["spectral_radius"] = {unit: loop.unit(unit).largest_pole() for unit in covered.unit_ids}
-    if unstable := [unit for unit, radius in known["spectral_radius"].items() if radius >= 1]:
+    scaled, units = models.normalised(), covered.unit_ids
+    radius = {unit: loop.around(scaled.systems([unit])[0]).system.largest_pole() for unit in units}
+    if unstable := [unit for unit, value in radius.items() if value >= 1]:
         reasons.append(f"it is unstable with {', '.join(unstable)}")
-    known |= bounds(loop, covered.nominal_id)
+    known |= bounds(loop, tolerance)
     if known["destabilising"] <= 1:
         reasons.append("it is unstable with a member of the set")
-    if reasons:
-        return LoopResult(LoopStatus.NOT_SAFE, tuple(reasons), **known)
-    return LoopResult(LoopStatus.SAFE if known["margin"] >= 1 else LoopStatus.UNDECIDED, **known)
+    safe = "SAFE" if known.get("margin", 0.0) >= 1 else "UNDECIDED"
+    return LoopResult(
+        "NOT SAFE" if reasons else safe, tuple(reasons), diverged=diverged, spectral_radius=radius, **known
+    )
 
 
-def bounds(loop: LinearLoop, nominal: str) -> dict[str, float]:
+def bounds(loop: LinearLoop, tolerance: float) -> dict[str, float]:
     """Return margin, what destabilises, and gains; where the nominal loop is not stable, that nothing is needed."""
-    blocks = loop.blocks()
+    blocks = loop.perturbed()
     if not blocks.system.is_stable():
         return {"destabilising": 0.0}
-    found = peak(blocks.part(len(blocks.sizes) - 1), DEFAULT.tolerance)
-    known = {"margin": 1 / found.upper, "destabilising": 1 / found.lower, "at_hz": found.at_hz}
-    if known["margin"] > 1:
-        known |= {"error_gain": worst_gain(blocks, DEFAULT.tolerance), "nominal_gain": hinf_norm(loop.unit(nominal))}
+    perturbation, block = blocks.perturbation, blocks.places[1]
+    level, nu = least_level(perturbation, perturbation.places[1] >= 0, tolerance)
+    known = {"margin": 1 / level, "destabilising": 1 / attained(perturbation, nu)[0]}
+    known["at_hz"] = float(np.arctan(nu) / (np.pi * blocks.system.dt))
+    if level < 1:
+        known["error_gain"] = least_level(blocks, block == len(blocks.sizes) - 1, tolerance)[0]
+        known["nominal_gain"] = hinf_norm(loop.around(loop.problem.scaled_model).system)
     return known

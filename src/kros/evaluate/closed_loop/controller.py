@@ -1,0 +1,79 @@
+"""A controller that uses estimates, as people give it: matrices and names of signals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+from pydantic import Field
+
+from ...core.arrays import Array
+from ...core.errors import ConfigError
+from ...core.files import did_you_mean
+from ...core.lti import StateSpace, gain, real_array
+from ...core.rounding import AGREED
+from ...core.settings import Settings
+from ...identify import ModelSet
+from ...observer.data import ObserverData
+from ...observer.units import recorded_factors
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+class Controller(Settings):
+    """A discrete controller from estimates to inputs of the plant, by name, in the units of the recordings.
+
+    Its output is added to the command, ``u = r + K x_hat``: one that opposes has the minus sign in it. Without A, B and
+    C it is a gain.
+
+    Examples
+    --------
+    >>> from kros.evaluate.closed_loop import Controller
+    >>> Controller(D=[[-2.0]], sample_period_s=0.001, inputs=["velocity"], outputs=["voltage"]).limits
+    {}
+    """
+
+    A: Rows = ()
+    B: Rows = ()
+    C: Rows = ()
+    D: Rows
+    sample_period_s: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    limits: dict[str, tuple[float, float]] = Field({}, description="of the plant's inputs, where actuators have some")
+
+    @classmethod
+    def from_system(cls, system: Any) -> Self:
+        """Return the controller of a `control.StateSpace` whose inputs and outputs are named as the channels."""
+        content: dict[str, Any] = {name: np.asarray(getattr(system, name)).tolist() for name in "ABCD"}
+        content |= {f"{side}s": getattr(system, f"{side}_labels", ()) for side in ("input", "output")}
+        return cls.of(content | {"sample_period_s": system.dt}, "Controller")
+
+    def between(self, observer: ObserverData, models: ModelSet) -> StateSpace:
+        """Return the system from all estimated states to all recorded inputs, in the units of the models."""
+        dt, n, q, m = models.sample_period_s, len(self.A), len(self.inputs), len(self.outputs)
+        if not np.isclose(self.sample_period_s, dt, rtol=AGREED):
+            raise ConfigError(f"Controller: sampled at {self.sample_period_s} s, the models at {dt} s; convert it.")
+        matrices = []
+        for name, shape in {"A": (n, n), "B": (n, q), "C": (m, n), "D": (m, q)}.items():
+            matrix = real_array(f"Controller: {name}", getattr(self, name))
+            if matrix.size != np.prod(shape) or (matrix.size and matrix.shape != shape):
+                named = f"with {q} inputs and {m} outputs named, {n} states"
+                raise ConfigError(f"Controller: {name} should have the shape {shape} {named}, found {matrix.shape}.")
+            matrices.append(matrix.reshape(shape))
+        read, write = (
+            self._places(observer, *signals)
+            for signals in ((self.inputs, observer.recorded), (self.outputs, models.recorded_inputs))
+        )
+        A, B, C, D = matrices
+        return gain(write, dt) @ StateSpace(A, B, C, D, dt) @ gain(np.linalg.pinv(read), dt)
+
+    @staticmethod
+    def _places(observer: ObserverData, names: Sequence[str], known: Sequence[str]) -> Array:
+        """Return what the recorded value of every named signal is in all that are known, (known, names)."""
+        for name in names:
+            if name not in known:
+                hint = did_you_mean(name, known) or ";"
+                raise ConfigError(f"Controller: signal {name!r} is unknown{hint} there are {', '.join(known)}.")
+        return np.eye(len(known))[:, [known.index(name) for name in names]] * recorded_factors(observer, names)

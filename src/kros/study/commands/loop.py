@@ -1,0 +1,21 @@
+"""`kros loop`: whether a controller may use the estimates of a run's observer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ...core.artifacts import read_json
+from ...evaluate.closed_loop import Controller, LoopResult, close_loop
+from ...uncertainty.quantify import UncertainModels
+from ..config import Stage
+from ..engine.store import open_finished
+from .field import load_observer
+
+STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)
+
+
+def judge_controller(run: Path, file: Path, observer: str = "deployed") -> LoopResult:
+    """Judge the loop of a controller, a state space as JSON, over the estimates of an observer of a run."""
+    controller = Controller.of(read_json(file), f"Controller {file}")
+    with open_finished(run, *STAGES) as (_, store):
+        return close_loop(load_observer(store, observer), UncertainModels.load(run), controller)

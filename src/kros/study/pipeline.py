@@ -14,6 +14,7 @@ from ..core.work import Executor, Progress, Work
 from ..data import Population
 from ..data.readers.opening import detect_reader
 from ..data.shown import Shown
+from ..identify import IdentifiedModels
 from ..observer import Observer
 from ..report.facts import Facts
 from ..report.verdict import judge
@@ -76,6 +77,7 @@ def run(
     source: Population | StudyConfig | Path | str,
     out: Path | str,
     *,
+    models: IdentifiedModels | None = None,
     until: Stage | str = Stage.REPORT,
     workers: int = 1,
     scheduler: str | None = None,
@@ -91,6 +93,9 @@ def run(
         `load_config` returns.
     out : Path or str
         Run folder; a stage whose result is there is skipped.
+    models : IdentifiedModels, optional
+        Of a population, as `kros.identify` returned them: they are not identified again. Where units are left out,
+        models of the others are identified as the study's tables say.
     until : Stage or str
         Last stage to run.
     workers : int
@@ -126,10 +131,12 @@ def run(
     until, given = member(Stage, until, "--until"), source if isinstance(source, Population) else None
     out = Path(out) if scheduler is None else Path(out).absolute()  # workers elsewhere have another current folder
     config = study_of(source, out, sections)
+    if models is not None and given is None:
+        raise ConfigError("Run: models are given without their recordings; give the population that they are of.")
     require_own(out, config)
     require_usable(config, until, given)
     with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
-        return run_in(store, config, until, executor, progress, given)
+        return run_in(store, config, until, executor, progress, given, models)
 
 
 def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: Mapping[str, Any]) -> StudyConfig:
@@ -173,9 +180,10 @@ def run_in(
     executor: Executor,
     progress: Progress | None = None,
     given: Population | None = None,
+    models: IdentifiedModels | None = None,
 ) -> RunResult:
     """Run a study in its run folder, which is open."""
-    context = Context(config, store, Work(executor, progress or Progress()), given)
+    context = Context(config, store, Work(executor, progress or Progress()), given, models)
     run_steps(context, STEPS, until)
     metrics = collect_metrics(context, until)
     write_json(store.path(METRICS), metrics)

@@ -28,12 +28,13 @@ from .store import METRICS, STUDY, Store, code_key
 
 @dataclass(frozen=True)
 class Context:
-    """What a stage gets: the study, its run folder, where work runs, and recordings that are given as arrays."""
+    """What a stage gets: the study, its run folder, where work runs, and recordings and models that are given."""
 
     config: StudyConfig
     store: Store
     work: Work
     given: Population | None = None
+    models: IdentifiedModels | None = None
 
     @cached_property
     def facts(self) -> RecordingFacts:
@@ -48,11 +49,15 @@ class Context:
     @cached_property
     def lifting(self) -> Lifting:
         """The Koopman lifting of the study; without functions where none is declared and none suits the plant."""
+        if self.models is not None:
+            return self.models.lifting
         return resolve_lifting(self.config.lifting, self.config.calibrate, self.population, self.config.split.test)
 
     @cached_property
     def phase_spec(self) -> PhaseSpec | None:
         """What is calibrated, if anything."""
+        if self.models is not None:
+            return None if self.models.calibration is None else self.models.calibration.spec
         return resolve_phase(self.config.calibrate, self.population, self.lifting)
 
     @cached_property
@@ -139,9 +144,10 @@ def _outdate(context: Context, digests: Mapping[Stage, str]) -> None:
 def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, str]:
     """Return digests of what stages follow from: kros, the stages before, recordings, their part of the study."""
     tables, digest, digests = context.config.dump(), code_key(), dict[Stage, str]()
+    digest_inputs = {Stage.READ: inputs_digest, Stage.CALIBRATE: models_digest}
     for step in steps:
         if step.wanted(context.config):
-            inputs = inputs_digest(context) if step.stage is Stage.READ else ""
+            inputs = digest_inputs[step.stage](context) if step.stage in digest_inputs else ""
             digest = digest_of(digest, str(step.stage), inputs, [_part(tables, name) for name in step.sections])
             digests[step.stage] = digest
     return digests
@@ -161,6 +167,14 @@ def inputs_digest(context: Context) -> str:
         return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
     files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [Path(source)]
     return digest_of([(str(f), *stamp_of(f)) for f in files])
+
+
+def models_digest(context: Context) -> str:
+    """Return a digest of models that are given."""
+    if context.models is None:
+        return ""
+    sets = [(place, m.A.tobytes(), m.B.tobytes()) for place, m in context.models.sets.items()]
+    return digest_of(sets, context.models.parameters, context.models.lifting)
 
 
 def _digest(given: Population, key: EpisodeKey) -> str:

@@ -62,7 +62,7 @@ def test_a_bank_is_its_system_and_blocks_are_sums_of_steps():
 def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     recordings, _ = plant(units=3, spread=0.1)
     made = design(recordings)
-    whitening = Whitening.of(made, samples([made])[0])
+    (whitening,) = Whitening.of([made])
     (moments,) = Moments.of([made], [whitening])
     penalty, start = 1e-6, 0.1
     (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, start)])
@@ -136,7 +136,7 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     others = [k for k in recordings.keys if k.unit != key.unit and k.episode != key.episode]
     alone = replace(recordings, keys=tuple(others), lengths=recordings.lengths[: len(others)])
     made = design(alone, settings=settings)
-    whitening = Whitening.of(readout.design, readout.sample)
+    (whitening,) = Whitening.of([readout.design])
     (moments,) = Moments.of([made], [whitening])
     (coefficients,) = moments.solved(np.ones(len(moments.groups)), [tuple(readout.penalties[1])])
     group = readout.design.groups[key]
@@ -173,7 +173,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (len(bank.taps) - 2))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = samples([made], lambda y: y + 0.5)[0][0] - X
+    moved = samples([replace(made, shown=lambda y: y + 0.5)])[0][0] - X
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
@@ -354,7 +354,7 @@ def test_trust_in_the_start_ignores_groups_in_which_a_state_rests():
     recordings, _ = plant(units=3, episodes=3, spread=0.1)
     settings = FEW.model_copy(update={"parts": 3, "penalties": (1e-8,), "start_trust": (1.0, 0.1)})
     made = design(recordings, settings=settings)
-    (moments,) = Moments.of([made], [Whitening.of(made, samples([made])[0])])
+    (moments,) = Moments.of([made], Whitening.of([made]))
     parts = moments.of_groups("part")
     errors = np.zeros((len(parts), 2, 3))
     errors[:, 1] = 0.1  # the smaller error is no better

@@ -151,13 +151,14 @@ class Design:
     bank: Bank
     recordings: Recordings
     settings: EstimatorSettings
+    shown: Shown = interpolated
 
     @classmethod
     def of(cls, channels: Channels, recordings: Recordings, settings: EstimatorSettings) -> Design:
         """Return the design with the bank of its channels."""
         return cls(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
 
-    def rows(self, recordings: Recordings, rows: int, shown: Shown = interpolated) -> Iterator[Rows]:
+    def rows(self, recordings: Recordings, rows: int) -> Iterator[Rows]:
         """Yield episode, bank rows, targets and weights of every episode, with measurements as they are shown.
 
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
@@ -166,17 +167,17 @@ class Design:
         samples = thinned(recordings.lengths, rows, first)
         measured = list(self.channels.measured)
         for key, (at, weights) in zip(recordings.keys, samples, strict=True):
-            states, y, v = self.episode(recordings.read(key), shown)
+            states, y, v = self.episode(recordings.read(key))
             targets = states[at + 1] / recordings.size
             reference = v[at] @ self.channels.reference.T
             reference[:, self.channels.held] = y[at][:, self.channels.held]
             targets[:, measured] -= reference / recordings.size[measured]
             yield key, self.bank.rows(self.channels.filtered(v), at), targets, weights
 
-    def episode(self, batch: EpisodeBatch, shown: Shown = interpolated) -> tuple[Array, Array, Array]:
+    def episode(self, batch: EpisodeBatch) -> tuple[Array, Array, Array]:
         """Return states, measurements as they are shown, and channels of an episode, (n_samples, .)."""
         length, own = batch.lengths[0], {k: p[0] for k, p in batch.parameters.items()}
-        y = shown(batch.measurements(self.channels.measured)[:length, 0])
+        y = self.shown(batch.measurements(self.channels.measured)[:length, 0])
         return batch.states[:length, 0], y, self.channels.signals(y, batch.inputs[:length, 0], own)
 
     def signals(self, some: int, length: int) -> Array:
@@ -194,23 +195,31 @@ class Design:
         return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
 
     @property
+    def errors(self) -> list[tuple[float, Design]]:
+        """Errors that measurements may have: their weights, and designs that see them."""
+        bias, seen = self.recordings.bias, list[tuple[float, Shown]]()
+        if not self.channels.inputs_only:
+            seen.append((self.settings.gap_share, bridged))
+        if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
+            seen.append((1.0, lambda y: interpolated(y) + bias))
+        return [(share, replace(self, shown=shown)) for share, shown in seen]
+
+    @property
     def fine(self) -> Design:
         """The design of the bank with every delay."""
         return replace(self, bank=self.bank.fine)
 
 
-def in_step(
-    designs: Sequence[Design], recordings: Recordings, rows: int, shown: Shown = interpolated
-) -> Iterator[tuple[Rows, ...]]:
+def in_step(designs: Sequence[Design], recordings: Recordings, rows: int) -> Iterator[tuple[Rows, ...]]:
     """Yield what `Design.rows` yields of several designs, episode by episode: each is read once."""
     once = replace(recordings, read=lru_cache(maxsize=1)(recordings.read))
-    return zip(*(design.rows(once, rows, shown) for design in designs), strict=True)
+    return zip(*(design.rows(once, rows) for design in designs), strict=True)
 
 
-def samples(designs: Sequence[Design], shown: Shown = interpolated) -> list[tuple[Array, Array]]:
-    """Return thinned rows of the bank of every design, measurements as they are shown, and weights that sum to one."""
+def samples(designs: Sequence[Design]) -> list[tuple[Array, Array]]:
+    """Return thinned rows of the bank of every design, and weights that sum to one."""
     recordings, settings = designs[0].recordings, designs[0].settings
-    episodes = list(in_step(designs, recordings.some(settings.episodes // 2), settings.sample, shown))
+    episodes = list(in_step(designs, recordings.some(settings.episodes // 2), settings.sample))
     weights = np.concatenate([w for (*_, w), *_ in episodes])
     return [
         (np.vstack([rows for _, rows, *_ in of_one]), weights / weights.sum()) for of_one in zip(*episodes, strict=True)
@@ -221,31 +230,37 @@ def samples(designs: Sequence[Design], shown: Shown = interpolated) -> list[tupl
 class Whitening:
     """Principal directions of the bank."""
 
+    sample: tuple[Array, Array]  # thinned rows, from which they are found, with their weights
     directions: Array  # (p, r)
     penalty: Array  # (r,), 1 / sigma^2
     trust: Array  # (r, r), moments of the rows that say how far entries may be wrong, apart from the start
     start: Array  # (r, r), the same of values of the first sample that may be wrong by their size
 
     @classmethod
-    def of(cls, design: Design, sample: tuple[Array, Array]) -> Whitening:
-        """Find the directions from thinned rows, with their weights."""
+    def of(cls, designs: Sequence[Design]) -> list[Whitening]:
+        """Find the directions of every design, in one pass over the recordings."""
+        errors = [design.errors for design in designs]
+        every = iter(samples([*designs, *(wrong for several in errors for _, wrong in several)]))
+        right = [next(every) for _ in designs]
+        wrong = [[(share, next(every)[0]) for share, _ in several] for several in errors]
+        return [cls._found(*each) for each in zip(designs, right, wrong, strict=True)]
+
+    @classmethod
+    def _found(cls, design: Design, sample: tuple[Array, Array], errors: Sequence[tuple[float, Array]]) -> Whitening:
+        """Find the directions from thinned rows, and what rows with errors of weights add."""
         X, weights = sample
-        bank, settings, bias = design.bank, design.settings, design.recordings.bias
+        bank, settings = design.bank, design.settings
         size = bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
         trust, start = (np.diag(bank.trust(*of)) for of in ((settings.nonlinear_trust, 0.0), (0.0, 1.0)))
-        errors = [] if design.channels.inputs_only else [(settings.gap_share, bridged)]
-        if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
-            errors.append((1.0, lambda y: interpolated(y) + bias))
-        for share, shown in errors:
-            moved = (samples([design], shown)[0][0] - X) * scale * np.sqrt(share)
-            trust = np.vstack([trust, qr_triangle(moved)])
+        for share, wrong in errors:
+            trust = np.vstack([trust, qr_triangle((wrong - X) * scale * np.sqrt(share))])
         least = min(settings.start_trust) * start
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, least])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
         moments = (rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, start)))
-        return cls(directions, sigma[:count] ** -2.0, *moments)
+        return cls(sample, directions, sigma[:count] ** -2.0, *moments)
 
 
 @frozen
@@ -351,12 +366,10 @@ class Readout:
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Readout]:
         """Fit all states by every design, in two passes over the recordings."""
-        sampled = samples(designs)
-        moments = Moments.of(designs, [Whitening.of(*pair) for pair in zip(designs, sampled, strict=True)])
-        return [cls._fitted(*each) for each in zip(designs, sampled, moments, strict=True)]
+        return [cls._fitted(*each) for each in zip(designs, Moments.of(designs, Whitening.of(designs)), strict=True)]
 
     @classmethod
-    def _fitted(cls, design: Design, sample: tuple[Array, Array], moments: Moments) -> Readout:
+    def _fitted(cls, design: Design, moments: Moments) -> Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = moments.whitening
         weights, settings = condition_weights(moments), design.settings
@@ -369,7 +382,7 @@ class Readout:
         coefficients = np.array(list(moments.solved(weights, candidates)))[best, :, n].T
         return cls(
             design,
-            sample,
+            whitening.sample,
             whitening.directions @ coefficients * design.recordings.size,
             errors[:, best, n],
             moments.errors(coefficients),

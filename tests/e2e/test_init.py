@@ -212,6 +212,8 @@ def test_single_samples_without_a_value_cost_no_episode(kros, tmp_path, motors):
         values = motors.read(key)
         table = np.column_stack([motors.sample_period_s * np.arange(len(values)), values])
         table[100 + i, 2] = np.nan
+        if i == 0:
+            table[:, 3] = np.nan  # nothing to bridge: the episode cannot be used
         np.savetxt(
             recordings / f"{key.unit}_{key.episode}.csv",
             table,
@@ -222,7 +224,9 @@ def test_single_samples_without_a_value_cost_no_episode(kros, tmp_path, motors):
         )
     result = kros("init", recordings, "--out", tmp_path / "study.toml")
     assert result.exit_code == 0, result.output
-    assert f"NaN in {len(motors.episodes)} episodes is bridged by straight lines" in result.output
+    assert f"NaN in {len(motors.episodes) - 1} episodes is bridged by straight lines" in result.output
+    assert "left out, " in result.output
+    assert "would refuse" not in result.output
     found = open_source(load_config(tmp_path / "study.toml"))
     whole = np.array([found.read(key) for key in found.episodes])
-    np.testing.assert_allclose(whole, [motors.read(k) for k in motors.episodes], atol=2e-2 * np.abs(whole).max())
+    np.testing.assert_allclose(whole, [motors.read(k) for k in motors.episodes[1:]], atol=2e-2 * np.abs(whole).max())

@@ -110,14 +110,16 @@ def unit_of_factor(factor: float, unit: str) -> str:
 
 
 def split_header(text: str) -> tuple[str, str]:
-    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A`` or ``v_m/s``."""
+    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A``, ``v_m/s`` or ``v_m_s``."""
     text = text.strip()
     bracketed, after = _BRACKETED.match(text), _AFTER.match(text)
     if bracketed and bracketed[1]:
         return bracketed[1].strip(), bracketed[2]
-    stem, _, last = text.rpartition("_")
-    if stem and is_word(last) and (len(last) > 1 or last == "s") and last not in ("in", "no", "none", "min"):
-        return stem, last
+    words = text.replace("_per_", "_").split("_")
+    for count in range(min(2, len(words) - 1), 0, -1):  # rate_deg_s, then time_s
+        stem, last = "_".join(words[:-count]), "/".join(words[-count:])
+        if stem and is_word(last) and (len(last) > 1 or last == "s") and last not in ("in", "no", "none", "min"):
+            return stem, last
     split = after and is_word(after[2]) and (len(after[2]) > 1 or "/" in text or " in " in text)
     return (after[1].strip(), after[2]) if after and split else (text, "")
 

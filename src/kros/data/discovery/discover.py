@@ -105,7 +105,8 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str
         problem = "none of the files looked at holds rows of numbers"
         raise DataError(f"Looking at {paths[0].parent}: {problem}; check the folder.")
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
-    head = next(h for h in heads if (h.dialect, h.fields) == commonest)
+    usual = [h for h in heads if (h.dialect, h.fields) == commonest]
+    head = max(usual, key=lambda h: sum(map(h.is_numeric, range(len(h.fields)))))  # a sensor may have been off
     alike = {relative: path for relative, path in files.items() if _fits(path, head)}
     return head, alike, [relative for relative in files if relative not in alike]
 

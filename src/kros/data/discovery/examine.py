@@ -10,7 +10,7 @@ import numpy as np
 from ...core.errors import DataError
 from ...core.work import Work
 from ..population import EpisodeKey, Population
-from ..recording import GroupWatch, NonFiniteError, check_episode, check_increasing, copies_among, digest_of
+from ..recording import GroupWatch, NonFiniteError, check_episode, check_increasing, copies_among, digest_of, usable
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,8 @@ def _look(population: Population) -> list[EpisodeLook]:
             looks[key] = replace(look, digest=digest_of(values))
             watch.add(key, values)
         except NonFiniteError as error:
-            looks[key] = replace(look, nan=str(error), n_samples=len(recording.usable(look.period_s).values))
+            count = int(usable(values).all(axis=1).sum())
+            looks[key] = replace(look, nan=str(error), n_samples=count) if count else EpisodeLook(key, str(error))
         except DataError as error:
             looks[key] = EpisodeLook(key, str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())

@@ -162,6 +162,8 @@ def _spare(i: int, column: TableColumn, samples: Sequence[Array]) -> str:
         return f"stays at {ends.pop():g} in the files that were looked at"
     if all(_counts(s) for s in signals):
         return "counts the samples"
+    if column.kind == "time" and all(_rises(s) for s in signals):
+        return "a second column of time"
     return "by its name" if "spare" in _kinds_of(column.name) else ""
 
 
@@ -171,4 +173,4 @@ def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
         return ColumnPart.INPUT, "a command or a voltage, by name and unit"
     if column.kind in _STATES:
         return ColumnPart.STATE, f"{column.kind}, by name or unit"
-    return ColumnPart.LEFT_OUT, "a second column of time" if column.kind == "time" else UNKNOWN
+    return ColumnPart.LEFT_OUT, UNKNOWN

@@ -13,6 +13,7 @@ import pytest
 from scipy.linalg import expm
 
 from kros.data import Channel, Role, from_arrays, write_parquet
+from kros.study import RunResult
 
 PERIOD_S = 0.01
 CHANNELS = (
@@ -105,9 +106,16 @@ def test_good_units_are_not_flagged_for_being_recorded_less(checked, tmp_path, e
     assert {r["status"] == "not enough data" for r in rows} == {episodes * samples < 2000}
 
 
-def test_bad_units_are_found(checked, tmp_path) -> None:
-    rows = checked(recordings(tmp_path / "bad", NEW, 6, 400, bad=True))
+def test_bad_units_are_found(checked, run, tmp_path) -> None:
+    data = recordings(tmp_path / "bad", NEW, 6, 400, bad=True)
+    rows = checked(data)
     assert sum(r["outlier"] for r in rows) >= 4
+    check = RunResult(run, {}).check(data)
+    assert check.rows == rows
+    assert check.summary().splitlines()[1].startswith("n0  FAIL, ")
+    lines = check.plot().axes[0].lines
+    assert [line.get_ydata()[0] for line in lines[::2]] == [row["score"] for row in rows]
+    assert {line.get_ydata()[0] for line in lines[1::2]} == {rows[0]["threshold"]}
 
 
 def test_the_terminal_says_what_would_have_been_seen(kros, run, tmp_path) -> None:

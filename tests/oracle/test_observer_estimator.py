@@ -59,6 +59,14 @@ def test_a_bank_is_its_system_and_blocks_are_sums_of_steps():
     assert (len(bank), len(bank.fine)) == (coarse.shape[1], fine.shape[1])
 
 
+def test_a_lifting_that_makes_models_affine_has_the_same_channels():
+    ranges = {"position": (-3.0, 3.0), "u": (-3.0, 3.0)}
+    affine = replace(LIFTING, inputs=("u",), input_functions=("1",))
+    for family in FAMILIES:
+        one, other = (channels_of(lifting, (0,), ("u",), family, ranges, FEW) for lifting in (affine, LIFTING))
+        assert [f.text for f in one.lifting.input_formulas] == [f.text for f in other.lifting.input_formulas]
+
+
 def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     recordings, _ = plant(units=3, spread=0.1)
     made = design(recordings)

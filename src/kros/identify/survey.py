@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +25,7 @@ from ..data.population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Populatio
 from ..data.prepare import recording_marks
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..data.recording import CHECK, check_population, refuse_copies, some, title, usable_episodes
+from .likeness import moments, unlike
 
 
 def period_alerts(period_s: float) -> tuple[str, ...]:
@@ -118,6 +119,7 @@ class _GroupFacts:
     written: str | None
     resolution: dict[str, float]
     episodes: list[_EpisodeFacts]
+    moments: Array  # mean over the episodes, see `likeness`
 
 
 @dataclass(frozen=True)
@@ -187,10 +189,20 @@ def _facts(
         test=tuple(k for s in splits.values() for k in s.test),
         resolution={m: min(g.resolution[m] for g in read) for m in retained.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
-        alerts=period_alerts(retained.sample_period_s),
+        alerts=(*period_alerts(retained.sample_period_s), *_unlike(retained, read, groups)),
         reserve=tuple(options.reserve),
         digests={e.key: e.digest for e in episodes},
     )
+
+
+def _unlike(population: Population, read: Sequence[_GroupFacts], units: Collection[str]) -> list[str]:
+    """Return what is said about units whose recordings are unlike those of most, in any condition."""
+    by_condition: dict[str, dict[str, Array]] = {}
+    for group in read:
+        if group.episodes and (key := group.episodes[0].key).unit in units:
+            by_condition.setdefault(key.condition, {})[key.unit] = group.moments
+    names, several = [c.name for c in population.channels], [of for of in by_condition.values() if len(of) > 2]
+    return list(dict.fromkeys(text for of in several for text in unlike(list(of), names, list(of.values()))))
 
 
 def check_usable(
@@ -217,12 +229,14 @@ def _read_group(task: _Group) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
     population, record, written = task.population, None, None
     names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
+    covariances = list[Array]()
 
     def usable() -> Iterator[tuple[EpisodeKey, Array, str]]:
         for key, values, digest in usable_episodes(population, task.on_nan):
             for name in population.measured if not episodes else ():
                 resolution[name] = smallest_step(values[:, names.index(name)])
             episodes.append(_EpisodeFacts(key, digest, len(values)))
+            covariances.append(moments(values[:, : len(names)]))
             yield key, values, digest
 
     if task.folder is None:
@@ -230,7 +244,7 @@ def _read_group(task: _Group) -> _GroupFacts:
     else:
         record = write_group(population, task.folder, usable())
         written = file_digest(task.folder / record.file)
-    return _GroupFacts(record, written, resolution, episodes)
+    return _GroupFacts(record, written, resolution, episodes, np.mean(covariances, axis=0))
 
 
 def smallest_step(signal: Array) -> float:

@@ -24,6 +24,7 @@ PLOTS: dict[str, dict[str, str]] = {
     "UncertainModels": {"weights": "uncertainty:sets_figure"},
     "Design": _ESTIMATES,
     "Observer": _ESTIMATES,
+    "Check": {"scores": "outliers:check_figure"},
     "RunResult": {"figure": ":run_figure"},
 }
 """Class -> kind of figure -> module and function that draws it; its further parameters are the options of `plot`."""

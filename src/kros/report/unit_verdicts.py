@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from xml.etree import ElementTree
 from ..core.artifacts import json_bytes
 from ..core.errors import ConfigError
 from ..core.files import write_bytes
+from ..data.shown import Shown
 from ..uncertainty.outliers.score import FEWEST_UNITS, Status
 from .content import Column, Section, build
 from .html import filled
@@ -32,6 +34,19 @@ _COLUMNS = [
     "recorded_s",
     "reason",
 ]
+
+
+@dataclass(frozen=True, repr=False)
+class Check(Shown):
+    """What `kros check` says of units: one row of scores with a verdict for every unit and condition."""
+
+    rows: Rows
+
+    def __repr__(self) -> str:
+        return f"<Check: {', '.join(f'{unit} {verdict}' for unit, (verdict, _) in by_unit(self.rows).items())}>"
+
+    def _summary_rows(self) -> dict[str, Any]:
+        return {unit: f"{verdict}, {'; '.join(reasons)}" for unit, (verdict, reasons) in by_unit(self.rows).items()}
 
 
 class Verdict(StrEnum):

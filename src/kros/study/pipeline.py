@@ -17,7 +17,9 @@ from ..data.shown import Shown
 from ..identify import IdentifiedModels
 from ..observer import Observer
 from ..report.facts import Facts
+from ..report.unit_verdicts import Check
 from ..report.verdict import judge
+from .commands.check import check_units
 from .config import Stage, StudyConfig, load_config, validate_config
 from .engine.context import Context, StageStep, run_steps
 from .engine.executors import open_executor
@@ -71,6 +73,19 @@ class RunResult(Shown):
     def observer(self) -> Observer:
         """The observer that is deployed."""
         return Observer.load(self.folder / "observers" / "deployed.json")
+
+    def check(self, data: Path | str, workers: int = 1, same_unit: bool = False) -> Check:
+        """Return the scores of new units against the study with verdicts, as ``kros check``.
+
+        Parameters
+        ----------
+        data : Path or str
+            Recordings like those of the study, or a TOML file with ``[data]``.
+        workers : int
+        same_unit : bool
+            Whether a unit of a name that the study has is the same machine, which is compared with the others alone.
+        """
+        return Check(check_units(self.folder, Path(data), workers, same_unit))
 
 
 def run(

@@ -102,7 +102,7 @@ def channels_of(
     known = {*names[: len(measured)], *lifting.parameters}
     functions = [f.text for f in lifting.formulas if f.used <= known]
     functions += [text for f in lifting.formulas if (text := quadrature(f.text, f.used, lifting)) and f.used <= known]
-    of_inputs = [f.text for f in lifting.input_formulas if f.used <= known | set(inputs)]
+    of_inputs = [f.text for f in lifting.input_formulas if f.used and f.used <= known | set(inputs)]  # no constants
     functions = list(dict.fromkeys(functions))
     linear = len(measured) + len(functions) + len(inputs) + len(of_inputs)
     groups = [(name, *together) for name, together in settings.unbounded.items()]

@@ -1,0 +1,37 @@
+"""Units whose channels are recorded otherwise than those of most: another unit of measure, or another sign."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..core.arrays import Array
+from ..core.rounding import TINY
+from ..data.recording import CHECK
+
+
+def moments(values: Array) -> Array:
+    """Return the covariance of channels and their changes in an episode (n_samples, c), shape (2 c, 2 c)."""
+    changes = np.diff(values, axis=0)
+    return np.cov(np.hstack([values[1:], changes]).T, bias=True)
+
+
+def unlike(units: Sequence[str], channels: Sequence[str], covariances: Sequence[Array]) -> list[str]:
+    """Return a sentence for every channel of a unit whose size, or whose sign, is not that of most units."""
+    G, c = np.array(covariances), len(channels)
+    size = np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), TINY))
+    correlation = G / size[:, :, None] / size[:, None]
+    ratio = size[:, :c] / np.median(size[:, :c], axis=0)
+    sure = np.abs(correlation) > CHECK.correlation
+    usual = np.median(correlation, axis=0)
+    opposite = sure & (np.abs(usual) > CHECK.correlation) & (correlation * usual < 0)
+    found = []
+    for i, unit in enumerate(units):
+        for name, of in zip(channels, ratio[i].tolist(), strict=True):
+            if not 1 / CHECK.ratio < of < CHECK.ratio:
+                found.append(f"Unit {unit}: {name} moves {of:.3g} times as much as in most units; check its unit.")
+        if opposite[i].any():
+            name = channels[int(opposite[i].sum(axis=0).argmax()) % c]
+            found.append(f"Unit {unit}: {name} moves against other channels, unlike in most units; check its sign.")
+    return found

@@ -1,0 +1,43 @@
+"""Units that are recorded in another unit of measure, or with another sign, are named; those of a spread batch are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import kros
+from kros.identify.likeness import moments, unlike
+
+
+@pytest.fixture(scope="module")
+def motors():
+    return kros.plants.DcMotorPopulation(n_units=5, n_episodes=2, seconds=1.0, seed=3, spread=3.0).simulate().population
+
+
+def alerts(motors, factors: dict[tuple[str, str], float]) -> tuple[str, ...]:
+    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+    for (unit, name), factor in factors.items():
+        for values in data[unit]:
+            values[:, [c.name for c in motors.channels].index(name)] *= factor
+    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
+    found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)
+    return kros.identify(found, refine=False).facts.alerts
+
+
+def test_a_batch_with_spread_is_not_doubted(motors) -> None:
+    assert alerts(motors, {}) == ()
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "current", "voltage"])
+def test_another_sign_and_another_unit_of_measure_are_named(motors, name: str) -> None:
+    one, other = motors.unit_ids[1], motors.unit_ids[3]
+    against, size = alerts(motors, {(one, name): -1.0, (other, name): np.pi / 180})
+    assert against == f"Unit {one}: {name} moves against other channels, unlike in most units; check its sign."
+    assert size.startswith(f"Unit {other}: {name} moves 0.01")
+
+
+def test_moments_are_covariances_of_channels_and_changes() -> None:
+    values = np.random.default_rng(0).normal(size=(50, 2)).cumsum(axis=0)
+    wide = np.hstack([values[1:], values[1:] - values[:-1]])
+    np.testing.assert_allclose(moments(values), (wide - wide.mean(axis=0)).T @ (wide - wide.mean(axis=0)) / 49)
+    assert unlike(["a", "b", "c"], ["x", "rest"], [np.diag([1.0, 0, 1, 0])] * 3) == []

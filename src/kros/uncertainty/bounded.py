@@ -7,9 +7,7 @@ there.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,12 +16,13 @@ from ..core.arrays import AnyArray, ArrayLike
 from ..core.errors import ConfigError
 from ..core.frequency import check_grid, log_grid
 from ..core.linalg import sigma_max
+from ..core.lti import StateSpace
 from .forms import Form, check_responses, misfit
 from .inputs import Options, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal import choose_nominal
 from .settings import SET
-from .weights.fit import Residuals, fit_weight
+from .weights.fit import Residuals, Sampled, fit_weight
 
 _LOG = logging.getLogger(__name__)
 
@@ -35,13 +34,7 @@ def bound_systems(models: Any, form: Form, freqs_hz: ArrayLike | None, options: 
     units = scale_system(system, *scales)
     grid = log_grid(system.dt, longest_s=getattr(models, "longest_s", None)) if freqs_hz is None else freqs_hz
     freqs = check_grid(grid, system.dt)
-
-    def residuals(index: int) -> Residuals:
-        nominal = units[index]
-        every = partial(Residuals, systems=(nominal, units))
-        return every(form, nominal.frequency_response, lambda f, rows: units[rows].frequency_response(f), len(ids))
-
-    fields = _bound(residuals, form, units.frequency_response(freqs), freqs, system.dt, ids, options)
+    fields = _bound(form, units, freqs, system.dt, ids, options)
     nominal = system[fields["nominal"]]
     return UncertainModel(nominal_system=nominal, output_scale=scales[0], input_scale=scales[1], **fields)
 
@@ -56,13 +49,8 @@ def bound_responses(
     freqs = check_grid(freqs_hz, float(dt))
     G = check_responses(responses, ids, freqs)
     scales = options.scales(G.shape[2:])
-    units = G / scales[0][:, None] * scales[1]
-
-    def residuals(index: int) -> Residuals:
-        nominal = partial(_between, freqs, units[index], axis=0)
-        return Residuals(form, nominal, lambda f, rows: _between(freqs, units[rows], f), len(ids))
-
-    fields = _bound(residuals, form, units, freqs, float(dt), ids, options)
+    units = Sampled(freqs, G / scales[0][:, None] * scales[1])
+    fields = _bound(form, units, freqs, float(dt), ids, options)
     fields |= {"output_scale": scales[0], "input_scale": scales[1], "sample_period_s": float(dt)}
     certificate = _certificate(freqs, fields["bounds"][form])
     return ResponseUncertainty(nominal_response=G[fields["nominal"]], certificate=certificate, **fields)
@@ -81,26 +69,14 @@ def _certificate(freqs: AnyArray, bound: AnyArray) -> str:
     return text
 
 
-def _between(freqs: AnyArray, values: AnyArray, at_hz: AnyArray, axis: int = 1) -> AnyArray:
-    """Return responses (unit, frequency, p, m) at other frequencies, on straight lines, constant beyond the ends."""
-    from scipy.interpolate import make_interp_spline
-
-    return make_interp_spline(freqs, values, k=1, axis=axis)(np.clip(at_hz, freqs[0], freqs[-1]))
-
-
 def _bound(
-    of: Callable[[int], Residuals],
-    form: Form,
-    units: AnyArray,
-    freqs: AnyArray,
-    dt: float,
-    ids: tuple[str, ...],
-    options: Options,
+    form: Form, units: StateSpace | Sampled, freqs: AnyArray, dt: float, ids: tuple[str, ...], options: Options
 ) -> dict[str, Any]:
     """Return the set around the best nominal or that of the options, with the remainder where the form leaves one."""
-    choices = {form: choose_nominal(units, form) for form in Form}
+    responses = units.frequency_response(freqs)
+    choices = {form: choose_nominal(responses, form) for form in Form}
     index, target = options.row(ids, choices[form].index), (dt, options.max_order, options.tolerance_db)
-    residuals, G = of(index), units[index]
+    residuals, G = Residuals(form, units[index], units, len(ids)), responses[index]
     weight, cover = fit_weight(residuals, freqs, *target)
     ratios, largest = zip(*((misfit(form, G, Gp), sigma_max(E)) for Gp, E in residuals.pieces(freqs)), strict=True)
     ratio, bound = np.concatenate(ratios), np.concatenate(largest).max(axis=0)

@@ -8,7 +8,6 @@ from ..core.arrays import AnyArray, ArrayLike, frozen
 from ..core.linalg import sigma_max
 from ..identify.refine.minimax import smallest_largest
 from .forms import Form, as_form, check_responses, residual
-from .settings import SET
 
 
 @frozen
@@ -52,18 +51,9 @@ def choose_nominal(responses: ArrayLike, form: Form | str) -> NominalChoice:
     (1, [7.0])
     """
     form, G = as_form(form), check_responses(responses)
-    n_units, n_freqs = G.shape[:2]
-    step = max(1, SET.at_once // n_freqs)
+    every = np.arange(G.shape[1])
 
-    def against(rows: AnyArray, witness: AnyArray) -> AnyArray:
-        """Residuals of the witness of every frequency for some nominals, shape (nominal, frequency)."""
-        parts, worst = np.split(rows, range(step, len(rows), step)), G[witness, np.arange(n_freqs)]
-        return np.concatenate([sigma_max(residual(form, G[part], worst)) for part in parts])
+    def size(nominal: AnyArray, perturbed: AnyArray) -> AnyArray:
+        return sigma_max(residual(form, G[nominal, every], G[perturbed, every]))
 
-    def bound(row: int) -> tuple[AnyArray, AnyArray]:
-        """Largest residual over the units and which unit it is, shape (frequency,)."""
-        parts = (G[k : k + step] for k in range(0, n_units, step))
-        sizes = np.concatenate([sigma_max(residual(form, G[row], part)) for part in parts])
-        return sizes.max(axis=0), sizes.argmax(axis=0)
-
-    return NominalChoice(*smallest_largest((n_units, n_freqs), bound, against)[:2])
+    return NominalChoice(*smallest_largest((len(G), len(every)), size))

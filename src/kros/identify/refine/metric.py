@@ -76,16 +76,10 @@ def peak_residual(A: Array, B: Array, points: int = 200) -> float:
     z = unit_circle(points)
     G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
     inverse, G, every = entries_first(np.linalg.pinv(G)), entries_first(G), np.arange(points)  # (m, n, unit, frequency)
-
-    def bound_of(row: int) -> tuple[AnyArray, AnyArray]:
-        sizes = sigma_max_first(multiply(inverse, G[:, :, row, None] - G))
-        return sizes.max(axis=0), sizes.argmax(axis=0)
-
-    def against(rows: AnyArray, witness: AnyArray) -> AnyArray:
-        farthest = G[:, :, None, witness, every]
-        return sigma_max_first(multiply(inverse[:, :, None, witness, every], G[:, :, rows] - farthest))
-
     if np.array_equal(G, np.broadcast_to(G[:, :, :1], G.shape)):
         return 0.0
-    _, _, peaks, exact = smallest_largest((len(A), points), bound_of, against)
-    return float(peaks[exact].min())
+
+    def size(nominal: AnyArray, unit: AnyArray) -> AnyArray:
+        return sigma_max_first(multiply(inverse[:, :, unit, every], G[:, :, nominal, every] - G[:, :, unit, every]))
+
+    return float(smallest_largest((len(A), points), size)[1].max())

@@ -18,27 +18,31 @@ from ...core.arrays import AnyArray
 from ...core.rounding import ITERATED
 
 TIE = ITERATED  # relative; scores closer than rounding are one
+_AT_ONCE = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
 
 
-def smallest_largest(
-    shape: tuple[int, int],
-    bound_of: Callable[[int], tuple[AnyArray, AnyArray]],
-    against: Callable[[AnyArray, AnyArray], AnyArray],
-) -> tuple[int, AnyArray, AnyArray, AnyArray]:
-    """Return the best candidate, its bound, all scores (lower bounds where not evaluated), and which are exact."""
-    lower, scores, evaluated = np.zeros(shape), np.zeros(shape[0]), np.zeros(shape[0], bool)
-    best, row = np.inf, 0
-    while scores[row] <= best * (1 + TIE):
-        lower[row], witness = bound_of(row)
-        scores[row], evaluated[row] = float(lower[row].max()), True
-        best = min(best, scores[row])
-        rows = np.flatnonzero(~evaluated & (scores <= best * (1 + TIE)))
+def smallest_largest(shape: tuple[int, int], size: Callable[[AnyArray, AnyArray], AnyArray]) -> tuple[int, AnyArray]:
+    """Return the best of the units as candidates, and its bound; of a `shape` (unit, frequency).
+
+    ``size(candidates, units)`` returns residuals, (row, frequency), for rows that broadcast to that: of a candidate and
+    all units, (1, 1) and (row, 1), and of candidates and the witness of every frequency, (row, 1) and (1, frequency).
+    """
+    lower, exact, row, step = np.zeros(shape), np.full(shape[0], np.inf), 0, max(1, _AT_ONCE // shape[1])
+    while lower[row].max() <= exact.min() * (1 + TIE):
+        at = np.array([[row]])
+        residuals = np.concatenate([size(at, part) for part in _pieces(np.arange(shape[0]), step)])
+        lower[row] = residuals.max(axis=0)
+        exact[row] = lower[row].max()
+        rows = np.flatnonzero(np.isinf(exact) & (lower.max(axis=1) <= exact.min() * (1 + TIE)))
         if not rows.size:
             break
-        lower[rows] = np.maximum(lower[rows], against(rows, witness))
-        scores[rows] = np.maximum(scores[rows], lower[rows].max(axis=1))
-        row = int(rows[np.argmin(scores[rows])])
-    exact = np.where(evaluated, scores, np.inf)
+        witness = residuals.argmax(axis=0)[None]
+        lower[rows] = np.maximum(lower[rows], np.concatenate([size(part, witness) for part in _pieces(rows, step)]))
+        row = int(rows[np.argmin(lower[rows].max(axis=1))])
     least = exact.min()
     index = int(np.argmax(exact <= least + TIE * np.abs(least)))  # the first of those that rounding may have told apart
-    return index, lower[index], scores, evaluated
+    return index, lower[index]
+
+
+def _pieces(rows: AnyArray, step: int) -> list[AnyArray]:
+    return np.split(rows[:, None], range(step, len(rows), step))

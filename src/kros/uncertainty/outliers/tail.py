@@ -43,19 +43,8 @@ def factor(count: int, rate: float) -> float:
 
 def scale(levels: AnyArray) -> AnyArray:
     """Return b over the first axis, of at least two levels."""
-    return _scale(len(levels), levels.sum(axis=0), levels.min(axis=0), levels.max(axis=0))
-
-
-def scales_without_one(levels: AnyArray) -> AnyArray:
-    """Return b of all but one for each of at least three levels, of the shape of `levels`."""
-    ordered, rows = np.sort(levels, axis=0), np.arange(len(levels)).reshape(-1, *[1] * (levels.ndim - 1))
-    least = np.where(rows == levels.argmin(axis=0), ordered[1], ordered[0])
-    largest = np.where(rows == levels.argmax(axis=0), ordered[-2], ordered[-1])
-    return _scale(len(levels) - 1, levels.sum(axis=0) - levels, least, largest)
-
-
-def _scale(count: int, total: AnyArray, least: AnyArray, largest: AnyArray) -> AnyArray:
-    return np.maximum(total - count * least + largest - least, 0.0) / (count - 1)
+    count, least = len(levels), levels.min(axis=0)
+    return np.maximum(levels.sum(axis=0) - count * least + levels.max(axis=0) - least, 0.0) / (count - 1)
 
 
 def excesses(peaks: AnyArray, inliers: Flags) -> AnyArray:
@@ -74,7 +63,8 @@ def margins(levels: AnyArray, inliers: Flags, rate: float) -> tuple[AnyArray, An
     value, bound = excesses(levels.max(axis=1), inliers), np.full(len(levels), np.inf)
     bound[~inliers] = factor(count, rate) * scale(known).mean()
     if count > 2:
-        bound[inliers] = factor(count - 1, rate) * scales_without_one(known).mean(axis=1)
+        others = [scale(np.delete(known, row, axis=0)).mean() for row in range(count)]
+        bound[inliers] = factor(count - 1, rate) * np.array(others)
     return value, value - np.maximum(bound, OUTLIER.rounding_db)
 
 

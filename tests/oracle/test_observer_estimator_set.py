@@ -50,7 +50,7 @@ def problem(form, size=0.3, seed=0, dynamic=False, **changes):
     parts |= {"input_scale": np.array([1.5]), "output_scale": np.array([0.8, 1.2, 0.5])}
     parts |= {"process_noise": np.array([0.0, 0.01, 0.02])} | changes
     case = ObserverProblem(NOMINAL, np.eye(3)[:1], form=form, **parts)
-    largest = 1.0 if case.N is None else hinf_norm(case.N)
+    largest = hinf_norm(case.N) or 1.0
     W_L = case.W_L
     return replace(case, W_L=replace(W_L, C=W_L.C * size / largest, D=W_L.D * size / largest))
 

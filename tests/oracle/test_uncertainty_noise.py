@@ -8,7 +8,7 @@ import pytest
 from kros.core.errors import DataError
 from kros.core.linalg import qr_triangle
 from kros.identify import KoopmanMatrices
-from kros.identify.bootstrap import ModelSamples, bootstrap_edmd, episode_weights
+from kros.identify.edmd import ModelSamples, bootstrap_edmd, episode_weights
 from kros.uncertainty import Form
 from kros.uncertainty.noise import noise_share
 

@@ -15,9 +15,8 @@ from ..identify import ModelSet, free_run
 from ..observer import Observer
 from ..observer.sensor import Sensors
 from ..observer.simulate import run_observers
-from .errors import ErrorSummary, joined, summarise
+from .errors import ErrorSummary, TrueErrors, joined, summarise, true_errors
 from .sensor import as_shown
-from .truth import TrueErrors, true_errors
 
 Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
 SIDE_BY_SIDE = 16  # episodes

@@ -154,7 +154,7 @@ def _error_phase(turn: Array, error: Array) -> float:
 
 def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitPhase:
     """Combine a unit's segments, each direction and speed by itself; needs a speed in both directions."""
-    phases, lags, weights, concentrations = [], [], [], []
+    rows = []
     remaining = sorted(segments, key=lambda s: -abs(s.speed))
     while remaining:
         speed = abs(remaining[0].speed)
@@ -163,20 +163,19 @@ def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitP
         forward, reverse = ([s for s in group if (s.speed > 0) is ahead] for ahead in (True, False))
         if forward and reverse:
             (psi_f, r_f), (psi_r, r_r) = _circular_mean(forward), _circular_mean(reverse)
-            phases.append((psi_f + psi_r) / 2)
-            lags.append((psi_f - psi_r) / 2)
-            concentrations.append(min(r_f, r_r))
-            weights.append(min(len(forward), len(reverse)))
-    if not phases:
+            shares = min(r_f, r_r), min(len(forward), len(reverse))
+            rows.append(((psi_f + psi_r) / 2, (psi_f - psi_r) / 2, *shares))
+    if not rows:
         ahead = sum(s.speed > 0 for s in segments)
         directions = {"forward": ahead, "reverse": len(segments) - ahead}
         raise IdentificationError(
             f"Phase calibration of unit {unit}: needs constant-velocity segments of equal speed in both directions, "
             f"found {directions}; record such motion, or lift with sine and cosine and no phase parameter."
         )
+    phases, lags, concentrations, weights = np.array(rows).T
     best = int(np.argmax(weights))
     # Phases of other speeds are put on the best speed's branch before averaging; their lags differ and are not mixed.
-    aligned = [p + np.pi * np.round((phases[best] - p) / np.pi) for p in phases]
+    aligned = phases + np.pi * np.round((phases[best] - phases) / np.pi)
     concentration = float(np.average(concentrations, weights=weights))
     if concentration < spec.least_concentration:
         log.warning("phase calibration of unit %s: its segments agree poorly, concentration %.2f", unit, concentration)

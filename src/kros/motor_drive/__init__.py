@@ -11,7 +11,7 @@ Examples
 """
 
 from ..core.removed import refusing
-from .level import AngleLoad
+from .signals import AngleLoad
 
 __all__ = ["AngleLoad"]
 __getattr__ = refusing(__name__)

@@ -24,7 +24,7 @@ from ..core.arrays import AnyArray, frozen
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
 from ..core.linalg import sigma_max, squared
-from ..identify.bootstrap import ModelSamples
+from ..identify.edmd import ModelSamples
 from .forms import Form, evenly, residual
 from .settings import OUTLIER
 

@@ -23,11 +23,10 @@ from ..core.work import Work
 from ..data.shown import Shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
-from .bounded import bound_responses, bound_systems
+from .bounded import bound_responses, bound_systems, choose_nominal
 from .forms import Form, as_form, residual
 from .inputs import Options, read_response_data
 from .model import UncertainModel
-from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import QuantifySettings, WeightSettings

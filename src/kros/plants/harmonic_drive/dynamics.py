@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
+from ...core.arrays import AnyArray
 from .parameters import COUNT_RAD, GEAR_RATIO, SAMPLE_PERIOD_S, VELOCITY_POLE, DriveParameters, Gains
 
 SUBSTEPS = 2
@@ -93,22 +93,18 @@ def load_torque(p: DriveParameters, recorded: AnyArray) -> AnyArray:
     return p.load_inertia * acceleration + gravity
 
 
-@frozen
-class SimulatedSignals:
-    """What a simulation leaves behind, one row per trajectory."""
-
-    states: AnyArray  # shape (n, 3, n_samples): quantised position, its filtered difference, current without noise
-    velocity: AnyArray  # shape (n, 1, n_samples), rad/s; true velocity of the motor
-    load_torque: AnyArray  # shape (n_loaded, n_samples), float32, fraction of full-scale current; taken from the flange
-
-
 def simulate(
     p: DriveParameters, loaded: AnyArray, reference: AnyArray, targets: tuple[AnyArray, AnyArray], gains: Gains
-) -> SimulatedSignals:
-    """Simulate all trajectories; `targets` are position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
+) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Simulate all trajectories; `targets` are position (rad) and velocity (rad/s), shape (n_references, n_samples).
+
+    Returned are states, shape (n, 3, n_samples): quantised position, its filtered difference, current without noise;
+    the true velocity of the motor, rad/s, shape (n, 1, n_samples); and the load torque taken from the flange, a share
+    of full-scale current, shape (n_loaded, n_samples), float32.
+    """
     n, n_samples, is_loaded = len(p), targets[0].shape[1], np.flatnonzero(loaded)
     states, velocity = np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples))
-    out = SimulatedSignals(states, velocity, np.empty((len(is_loaded), n_samples), np.float32))
+    load_signals = np.empty((len(is_loaded), n_samples), np.float32)
     physics = Physics(p, loaded, targets[0][reference, 0])
     drive, with_load = _Controller(physics, gains), p.take(is_loaded)
     recorded = np.empty((BLOCK_SAMPLES, RECORDED, n))
@@ -121,11 +117,11 @@ def simulate(
             physics.advance()
         block = recorded[: stop - first]
         for row, signal in enumerate(_SIGNALS):
-            out.states[:, row, first:stop] = block[:, signal].T
-        out.velocity[:, 0, first:stop] = block[:, MEASURED + 1 + W].T
+            states[:, row, first:stop] = block[:, signal].T
+        velocity[:, 0, first:stop] = block[:, MEASURED + 1 + W].T
         torque = load_torque(with_load, block[..., is_loaded].swapaxes(0, 1))
-        out.load_torque[:, first:stop] = (torque / with_load.torque_constant).T
-    return out
+        load_signals[:, first:stop] = (torque / with_load.torque_constant).T
+    return states, velocity, load_signals
 
 
 class _Controller:

@@ -120,14 +120,14 @@ class HarmonicDrivePopulation(BatchSettings):
         samples, loop = (round(self.seconds / SAMPLE_PERIOD_S) + 1, REST_SAMPLES, SAMPLE_PERIOD_S), Loop(self.loop)
         inputs = [np.stack(episode_reference(self.seed, e, *samples)) for e in range(self.n_episodes)]
         position, velocity = np.stack(inputs, axis=1)
-        signals = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
-        self._disturb(signals.states, keys)
-        parts = {key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)}
+        states, true, torque = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
+        self._disturb(states, keys)
+        parts = {key: (states[i], inputs[episode[i]], true[i]) for i, key in enumerate(keys)}
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
-        torque = signals.load_torque[:, REST_SAMPLES:-1]
-        truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, torque)
+        names, signals = tuple(u.id for u in units), torque[:, REST_SAMPLES:-1]
+        truth = Truth(names, parameters, loop, GAINS[loop], load_rows, signals)
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Any]:

@@ -50,7 +50,7 @@ from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
-from ...core.rounding import AGREED
+from ...core.rounding import AGREED, TINY
 from ...core.settings import member
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
@@ -110,15 +110,15 @@ class ObserverProblem:
         n, m, q, kept = self.nominal.n_states, self.nominal.n_inputs, len(self.C), self.n_original
         self._require(self.C.shape[1] == n, f"C should be (q, {n}) for {n} lifted states, found {self.C.shape}")
         self._require(kept is None or 1 <= kept <= n, f"n_original = {kept} should lie between 1 and {n}")
-        for name, size in (("input_scale", m), ("output_scale", n), ("noise", q)):
+        if self.process_noise is None:
+            put("process_noise", np.zeros(n))
+        positive = ("input_scale", m, TINY), ("output_scale", n, TINY), ("noise", q, TINY)
+        for name, size, least in (*positive, ("process_noise", n, 0.0)):
             value = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value > 0)))
-            self._require(valid, f"{name} should be {size} positive numbers, found {value}")
+            valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value >= least)))
+            wanted = f"{size} {'positive numbers' if least else 'numbers of at least zero'}"
+            self._require(valid, f"{name} should be {wanted}, found {value}")
             put(name, value)
-        level = np.zeros(n) if self.process_noise is None else np.asarray(self.process_noise, dtype=float)
-        valid = level.shape == (n,) and bool(np.all(np.isfinite(level) & (level >= 0)))
-        self._require(valid, f"process_noise should be {n} numbers of at least zero, found {level}")
-        put("process_noise", level)
         one = (self.remainder_left is None) != (self.remainder_right is None)
         self._require(self.injection is not Injection.NONE, "injection should be INPUT or STATE, found NONE")
         self._require(not one, "remainder_left and remainder_right come together, found only one of them")
@@ -223,11 +223,11 @@ class ObserverProblem:
         return self.W_R @ (seen if self.location.sees_input else self.scaled_model @ seen)
 
     @cached_property
-    def N(self) -> StateSpace | None:  # noqa: N802
-        """From what Delta does to what it sees; None for the forms without a loop."""
+    def N(self) -> StateSpace:  # noqa: N802
+        """From what Delta does to what it sees; zero for the forms without a loop."""
         form, G = self.location, self.scaled_model
         if not form.inverse:
-            return None
+            return gain(np.zeros((self.W_R.n_outputs, self.W_L.n_inputs)), self.nominal.dt)
         return self.W_R @ (self.W_L if form.at_input is form.sees_input else G @ self.W_L)
 
     @property
@@ -261,7 +261,7 @@ class ObserverProblem:
             if isinstance(system, StateSpace) and not system.is_stable():
                 radius = f"{name} has spectral radius {float(system.spectral_radius()):.9g}"
                 raise SynthesisError(f"Observer synthesis: {radius}; it must be below 1, use a stable model.")
-        size = 0.0 if self.N is None else hinf_norm(self.N)
+        size = hinf_norm(self.N)
         if size >= 1:
             raise SynthesisError(
                 f"Observer synthesis: ||N|| = {size:.6g} should be below 1 for "

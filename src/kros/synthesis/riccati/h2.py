@@ -18,6 +18,13 @@ L = (A Y C2' + B1 D21') S_y^-1;   L0 = (F Y C2' + F0 D21') S_y^-1
 References
 ----------
 K. Zhou, J. C. Doyle, K. Glover, *Robust and Optimal Control*, sections 14.5 and 21.7.
+
+Steady-state Kalman predictor: a constant correction of the state, ``x_hat+ = A x_hat + B u + L (y - C x_hat)``.
+
+Symbols
+-------
+Q, R : process and measurement noise covariance;  P : covariance of the one-step prediction error;  L : gain, shape (n,
+    q)
 """
 
 from __future__ import annotations
@@ -26,14 +33,15 @@ import time
 
 import numpy as np
 
-from ...core.errors import SynthesisError
-from ...core.lti import StateSpace
+from ...core.arrays import AnyArray, ArrayLike
+from ...core.errors import DimensionError, SynthesisError
+from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm, hinf_norm
-from ...core.rounding import ROUNDING
-from ..assumptions import require
+from ...core.rounding import ROUNDING, TINY
+from ..assumptions import require, require_detectable
 from ..generalized_plant import GeneralizedPlant
-from ..result import Status, Synthesis
-from .equations import absorb_feedthrough, riccati_pair
+from ..result import Injection, Status, Synthesis
+from .equations import absorb_feedthrough, discrete_gain, riccati_pair, solve_riccati
 
 _AGREEMENT = 1e-4  # of the norm with its promise
 
@@ -108,3 +116,91 @@ def _optimum(p: GeneralizedPlant) -> tuple[StateSpace, float, float]:
     terms += [np.trace(R @ (F @ Y @ F.T + F0 @ F0.T)), -np.trace(R @ L0 @ S @ L0.T)]
     rounding = ROUNDING * sum(abs(term) for term in terms)  # the terms may cancel
     return K, float(np.sqrt(max(sum(terms), 0.0))), float(np.sqrt(rounding))
+
+
+def kalman(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, dt: float = 1.0) -> Synthesis:
+    """Return the steady-state Kalman predictor as a constant correction of the state.
+
+    Parameters
+    ----------
+    A : array_like, shape (n, n)
+        Discrete dynamics.
+    C : array_like, shape (q, n)
+        Measured combinations of the state.
+    Q : array_like, shape (n, n)
+        Process noise covariance, positive semidefinite.
+    R : array_like, shape (q, q)
+        Measurement noise covariance, positive definite.
+    dt : float, s
+        Sampling period of the result.
+
+    Returns
+    -------
+    Synthesis
+        ``controller.D`` is the gain L, shape (n, q); ``h2_norm`` is the root of the trace of the prediction error's
+        covariance.
+
+    Raises
+    ------
+    DimensionError
+        When sizes do not fit.
+    SynthesisError
+        When R is not positive definite, Q not positive semidefinite, or the pair (A, C) undetectable (the mode is
+        named).
+
+    Examples
+    --------
+    >>> from kros.synthesis import kalman
+    >>> synthesis = kalman([[1.0]], [[1.0]], [[1.0]], [[2.0]])
+    >>> float(synthesis.controller.D[0, 0])  # P = 2, L = 2 / (2 + 2)
+    0.5
+    """
+    A, C, Q, R = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (A, C, Q, R))
+    n, q = A.shape[0], C.shape[0]
+    if A.shape != (n, n) or C.shape != (q, n) or Q.shape != (n, n) or R.shape != (q, q):
+        shapes = f"{A.shape}, {C.shape}, {Q.shape}, {R.shape}"
+        raise DimensionError(f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {shapes}.")
+    if np.linalg.eigvalsh((R + R.T) / 2).min() <= 0:
+        raise SynthesisError("Kalman predictor: R is not positive definite; every measurement needs some noise.")
+    values, vectors = np.linalg.eigh((Q + Q.T) / 2)
+    if values.min() < -ROUNDING * max(values.max(), TINY):
+        problem = f"Q has the eigenvalue {values.min():.3g}"
+        raise SynthesisError(f"Kalman predictor: {problem}; it must be positive semidefinite.")
+    require_detectable(A, C, dt, "Kalman predictor")
+    start = time.perf_counter()
+    L, _ = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
+    elapsed = time.perf_counter() - start
+    closed = A - L @ C
+    radius = float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0))
+    if radius >= 1:
+        problem = f"the error dynamics have spectral radius {radius:.9g}"
+        raise SynthesisError(f"Kalman predictor: {problem}; add process noise on the modes on the unit circle.")
+    noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
+    norm = h2_norm(StateSpace(closed, noise, np.eye(n), np.zeros((n, n + q)), dt))
+    return Synthesis(
+        method="kalman",
+        controller=gain(L, dt),
+        status=Status.OPTIMAL,
+        injection=Injection.STATE,
+        h2_norm=norm,
+        spectral_radius=radius,
+        solve_s=elapsed,
+        solver="riccati",
+    )
+
+
+def predictor(
+    A: AnyArray, C: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray, method: str
+) -> tuple[AnyArray, AnyArray]:
+    """Gain and covariance of the one-step predictor for noise covariances Q, R and cross covariance S (n, q)."""
+    P = solve_riccati(A.T, C.T, Q, R, S, 1.0, method)
+    return -discrete_gain(A.T, C.T, R, S, P).T, P
+
+
+def predictor_bound(A: AnyArray, B: AnyArray, C: AnyArray, D: AnyArray, Z: AnyArray) -> float:
+    """Return the least ``E |Z (x - x_hat)|^2`` for ``x+ = A x + B nu``, ``y = C x + D nu``; zero if unknown."""
+    try:
+        _, P = predictor(A, C, B @ B.T, D @ D.T, B @ D.T, "Lower bound")
+    except SynthesisError:
+        return 0.0
+    return max(float(np.trace(Z @ P @ Z.T)), 0.0)

@@ -46,11 +46,8 @@ class Ball:
     right: AnyArray  # shape (f, a, m); ``R_r M``
 
     @classmethod
-    def of(cls, N: AnyArray | None, M: AnyArray, b: int) -> Ball:
-        """Build the ball of ``Delta (I - N Delta)^-1 M`` from N (f, a, b), None without a loop, and M (f, a, m)."""
-        if N is None:
-            f, _, m = M.shape
-            return cls(np.zeros((f, b, m), complex), np.broadcast_to(np.eye(b, dtype=complex), (f, b, b)), M)
+    def of(cls, N: AnyArray, M: AnyArray) -> Ball:
+        """Build the ball of ``Delta (I - N Delta)^-1 M`` from N (f, a, b) and M (f, a, m)."""
         U, s, Vh = np.linalg.svd(N)
         k = s.shape[-1]
         radius = 1 / np.sqrt(1 - s**2)
@@ -90,8 +87,7 @@ class Ball:
 
 def uncertain_ball(problem: ObserverProblem, freqs_hz: AnyArray) -> Ball:
     """Return the ball of ``Delta (I - N Delta)^-1 M`` of a problem at frequencies."""
-    N = None if problem.N is None else problem.N.frequency_response(freqs_hz)
-    return Ball.of(N, problem.M.frequency_response(freqs_hz), problem.W_L.n_inputs)
+    return Ball.of(problem.N.frequency_response(freqs_hz), problem.M.frequency_response(freqs_hz))
 
 
 def spread(P: AnyArray, Q: AnyArray) -> AnyArray:

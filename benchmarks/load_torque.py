@@ -31,7 +31,7 @@ from kros.motor_drive.signals import TorqueScale, load_accuracy, low_passed, wit
 from kros.observer import Observer, Recordings, identify_estimator, relift_certificate, run_observer
 from kros.observer.residual import one_step_residual, one_step_rows
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.parameters import COUNT_RAD
+from kros.plants.harmonic_drive.dynamics import COUNT_RAD
 from kros.synthesis import kalman
 
 Array = npt.NDArray[np.float64]

@@ -12,7 +12,7 @@ import kros
 from kros.core.errors import ConfigError
 from kros.data import Population
 from kros.evaluate import fit_percent
-from kros.evaluate.validation import correlation, excitation
+from kros.evaluate.errors import correlation, excitation
 from kros.identify.identified import IdentifiedModels
 from kros.interop import to_control
 from kros.report.canvas import thin

@@ -5,6 +5,8 @@ Errors against what states really were, and how late a signal is.
 A recorded state may itself be an estimate: a drive's velocity is a filtered difference of positions, which trails. An
 observer that was made to agree with the recording then trails as well, and its error against the recording does not
 show it; error and lag against the truth do.
+
+Validation of models and excitations as in system identification: fit, correlation of residuals, coherence.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..core.arrays import Array, Whole, frozen
+from ..data.population import EpisodeKey, Population
 
 T = TypeVar("T")
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
@@ -139,3 +142,54 @@ def delay_samples(signals: Array, truths: Array) -> Array:
         delay = most - middle - 0.5 * (left - right) / bend
     known = np.isfinite(signals).all(axis=0) & (np.ptp(x, axis=0) > 0) & (best == middle) & (bend > 0)
     return np.where(known, delay, np.nan)
+
+
+def fit_percent(estimate: Array, recorded: Array) -> Array:
+    """Return ``100 (1 - |x - x_hat| / |x - mean(x)|)`` of every column, shape (n,), NaN for a constant one.
+
+    This is the fit of MATLAB's ``compare``: 100 % is exact, the mean of the recording has 0 %.
+
+    Parameters
+    ----------
+    estimate, recorded : ndarray, shape (n_samples, n)
+        Euclidean norms are over the samples of one episode.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import fit_percent
+    >>> recorded = np.array([[0.0], [2.0], [4.0]])  # less their mean: the norm is the root of 8
+    >>> fit_percent(recorded + np.array([[1.0], [0.0], [1.0]]), recorded).round(9).tolist()
+    [50.0]
+    """
+    spread = np.linalg.norm(recorded - recorded.mean(axis=0), axis=0)
+    ratio = np.linalg.norm(recorded - estimate, axis=0) / np.where(spread > 0, spread, np.nan)
+    return 100 * (1 - ratio)
+
+
+def correlation(later: Array, earlier: Array, lags: int) -> Array:
+    """Return the correlation coefficients of a signal with another 0, 1, ..., `lags` samples before."""
+    from scipy.signal import correlate
+
+    x, y = later - later.mean(), earlier - earlier.mean()
+    size = np.sqrt(x @ x * (y @ y))
+    return np.asarray(correlate(x, y)[len(y) - 1 :][: lags + 1] / (size if size > 0 else np.nan))
+
+
+def excitation(
+    population: Population, keys: Sequence[EpisodeKey], segment: int, averages: int
+) -> tuple[Array, Array, Array]:
+    """Return frequencies, Hz, power densities of channels (channel, frequency), and coherences (channel, channel, ...).
+
+    Spectra are means over episodes by Welch's method, with segments so short that the shortest episode has `averages`.
+    The coherence ``|S_ij|^2 / (S_ii S_jj)`` is the ordinary one, NaN where a channel is constant.
+    """
+    from scipy.signal import csd
+
+    episodes = [population.read(key).T for key in keys]
+    size = max(1, min(segment, min(x.shape[1] for x in episodes) // averages))
+    spectra = [csd(x[:, None], x, 1 / population.sample_period_s, nperseg=size) for x in episodes]
+    mean = np.average([s for _, s in spectra], axis=0, weights=[x.shape[1] for x in episodes])
+    power = np.einsum("iif->if", mean).real
+    power = np.where(power > 0, power, np.nan)
+    return spectra[0][0], power, np.abs(mean) ** 2 / (power[:, None] * power)

@@ -14,6 +14,8 @@ Symbols
 e     : tracking error, reference - measured; its periodic part at constant reference is that of -measured
 theta : angle, rad;  r : ratio of the disturbance to the angle
 psi_i : phase of the error in segment i, ``atan2(<e, cos r theta>, <e, sin r theta>)``, the closed form of (40)
+
+Phases of units that took no part in a calibration, or of which there are other recordings.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from ..core.artifacts import Storable, digest_of
 from ..core.errors import IdentificationError
 from ..core.rounding import TINY
 from ..core.work import Work
-from ..data.population import EpisodeKey, Population
+from ..data.population import EpisodeKey, Population, split_episodes
 from .survey import RecordingFacts
 
 log = logging.getLogger(__name__)
@@ -243,3 +245,62 @@ def calibration_keys(facts: RecordingFacts, unit: str) -> tuple[EpisodeKey, ...]
     """Return the episodes that a unit is calibrated on: those of `identify_on`, or of the first condition it has."""
     every = facts.keys("train", unit)
     return facts.keys("train", unit, facts.identify_on) or tuple(k for k in every if k.condition == every[0].condition)
+
+
+log = logging.getLogger(__name__)
+Values = dict[str, dict[str, float]]  # lifting parameters by unit
+Texts = dict[str, str]  # by unit
+
+
+def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
+    """Return the episodes that a unit is identified on: its training part, or its only episode."""
+    groups = {(u, c): keys for u, c, keys in population.groups()}
+    several = tuple(k for keys in groups.values() if len(keys) > 1 for k in keys)
+    splits = split_episodes(replace(population, episodes=several))
+    return groups | {group: split.train for group, split in splits.items()}
+
+
+def unit_values(
+    population: Population,
+    calibration: PhaseCalibration | None,
+    prefer: str,
+    given: Values | None = None,
+    facts: RecordingFacts | None = None,
+) -> tuple[Values, Texts, Texts]:
+    """Return the lifting parameters of units, where each came from, and why one is unknown.
+
+    They are given, calibrated in a condition, on the episodes that facts of these recordings name, or those of the run.
+    """
+    known, sources, reasons = {u: dict((given or {}).get(u, {})) for u in population.unit_ids}, Texts(), Texts()
+    if calibration is None:
+        return known, sources, reasons
+    training, spec = training_keys(population), calibration.spec
+    derived = "" if spec.measured in population.states else f" on the derivative of {spec.angle}"
+    for unit, values in known.items():
+        if spec.parameter in values:
+            sources[unit] = "given"
+            continue
+        by_condition = {condition: keys for (u, condition), keys in training.items() if u == unit}
+        keys = by_condition.get(prefer) or next(iter(by_condition.values()))
+        keys = keys if facts is None else calibration_keys(facts, unit)
+        try:
+            phase = calibration.calibrate(segments_of((population, keys, spec)), unit)
+            sources[unit] = f"calibrated{derived}"
+        except IdentificationError as error:
+            if unit not in calibration.units:
+                sources[unit], reasons[unit] = "unknown", str(error)
+                continue
+            phase, sources[unit] = calibration.units[unit], "of the run"
+            log.info("unit %s: its recordings do not determine the phase; the value of the run is used", unit)
+        values[spec.parameter] = phase.phase_rad
+    return known, sources, reasons
+
+
+def unit_parameters(
+    population: Population, calibration: PhaseCalibration | None, prefer: str, facts: RecordingFacts | None = None
+) -> Values:
+    """Return every unit's lifting parameters, as `unit_values` finds them; refuse one that is unknown."""
+    values, _, reasons = unit_values(population, calibration, prefer, facts=facts)
+    for reason in reasons.values():
+        raise IdentificationError(reason)
+    return values

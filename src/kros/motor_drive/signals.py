@@ -28,6 +28,7 @@ unloaded machine needs.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -171,50 +172,43 @@ class AngleLoad:
                 f"Level of a load: seen part {seen.shape}, current {current.shape} and position {position.shape} "
                 f"should all be (n_samples, batch)."
             )
-        running = _RunningAngleLoad(self, position[0])
-        rows = [running.step(*sample) for sample in zip(seen, current, position, strict=True)]
+        rows = list(self._running(seen, current, position))
         return LoadAndCurrent(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+    def _running(self, seen: Array, current: Array, position: Array) -> Iterator[tuple[Array, Array]]:
+        """Yield load and total current sample by sample, from the observer's and the measured angles in rad."""
+        limit, pole = self.limit, self.pole
+        before = np.stack([np.sin(position[0]), np.cos(position[0])])
+        psi, right = np.zeros_like(before), np.zeros_like(before)
+        excess, need = np.zeros((2, *position[0].shape))  # taken off the load, and off the unloaded current
+        gram = 0.5 * self.settling_s * np.eye(2)[:, :, None] * np.ones_like(position[0])
+        for tau, i, angle in zip(seen, current, position, strict=True):
+            phi = np.stack([np.sin(angle), np.cos(angle)])
+            phi = np.where(np.isnan(phi), before, phi)
+            psi = pole * psi + np.nan_to_num(phi - before)
+            before, excess, need = phi, pole * excess, pole * need
+            coefficients = np.linalg.solve(gram.transpose(2, 0, 1), right.T[..., None])[..., 0].T
+            of_angle = np.sum(np.nan_to_num(phi) * coefficients, axis=0)  # zero where no angle has arrived yet
+            load = tau - excess + of_angle - np.sum(psi * coefficients, axis=0)
+            total = i - tau - need + load
+            bounded = np.clip(total, -limit, limit)
+            beyond = bounded != total
+            if beyond.any():
+                shifted = load - (total - bounded)
+                trusted = beyond & (np.abs(shifted - of_angle) <= self.trusted * limit)
+                anew = beyond & ~trusted
+                excess[trusted] += (total - bounded)[trusted]
+                load[trusted] = shifted[trusted]
+                psi[:, anew], excess[anew], load[anew] = 0.0, tau[anew], of_angle[anew]
+                total[anew] = (i - tau - need + load)[anew]
+                bounded[anew] = np.clip(total[anew], -limit, limit)
+                need[anew] += (total - bounded)[anew]
+            learns = np.where(beyond, 0.0, self.sample_period_s)
+            gram = gram + learns * psi[:, None] * psi
+            right = right + learns * psi * (tau - excess)
+            yield load, bounded
 
     @property
     def pole(self) -> float:
         """What of a level is left after a sample."""
         return float(np.exp(-self.sample_period_s / self.level_s))
-
-
-class _RunningAngleLoad:
-    """`AngleLoad` sample by sample, for some machines at once."""
-
-    def __init__(self, settings: AngleLoad, position: Array) -> None:
-        self.settings, self._pole = settings, settings.pole
-        self._phi = np.stack([np.sin(position), np.cos(position)])
-        self._psi, self._right = np.zeros_like(self._phi), np.zeros_like(self._phi)
-        self._excess, self._need = np.zeros((2, *position.shape))  # taken off the load, and off the unloaded current
-        self._gram = 0.5 * settings.settling_s * np.eye(2)[:, :, None] * np.ones_like(position)
-
-    def step(self, seen: Array, current: Array, position: Array) -> LoadAndCurrent:
-        """Return load and total current now, from the observer's and the measured angles in rad."""
-        limit, pole = self.settings.limit, self._pole
-        phi = np.stack([np.sin(position), np.cos(position)])
-        phi = np.where(np.isnan(phi), self._phi, phi)
-        self._psi = psi = pole * self._psi + np.nan_to_num(phi - self._phi)
-        self._phi, self._excess, self._need = phi, pole * self._excess, pole * self._need
-        coefficients = np.linalg.solve(self._gram.transpose(2, 0, 1), self._right.T[..., None])[..., 0].T
-        of_angle = np.sum(np.nan_to_num(phi) * coefficients, axis=0)  # zero where no angle has arrived yet
-        load = seen - self._excess + of_angle - np.sum(psi * coefficients, axis=0)
-        total = current - seen - self._need + load
-        bounded = np.clip(total, -limit, limit)
-        beyond = bounded != total
-        if beyond.any():
-            shifted = load - (total - bounded)
-            trusted = beyond & (np.abs(shifted - of_angle) <= self.settings.trusted * limit)
-            anew = beyond & ~trusted
-            self._excess[trusted] += (total - bounded)[trusted]
-            load[trusted] = shifted[trusted]
-            psi[:, anew], self._excess[anew], load[anew] = 0.0, seen[anew], of_angle[anew]
-            total[anew] = (current - seen - self._need + load)[anew]
-            bounded[anew] = np.clip(total[anew], -limit, limit)
-            self._need[anew] += (total - bounded)[anew]
-        learns = np.where(beyond, 0.0, self.settings.sample_period_s)
-        self._gram = self._gram + learns * psi[:, None] * psi
-        self._right += learns * psi * (seen - self._excess)
-        return LoadAndCurrent(load, bounded)

@@ -22,11 +22,11 @@ import numpy as np
 
 from ..core.arrays import Array, frozen
 from ..data.population import Channel, Role
-from .batch import Batch, UnitTruth
+from .batch import POSITION, VELOCITY, Batch, UnitTruth
 
 CHANNELS = (
-    Channel("position", Role.STATE, "rad", measured=True),
-    Channel("velocity", Role.STATE, "rad/s"),
+    POSITION,
+    VELOCITY,
     Channel("current", Role.STATE, "A"),
     Channel("voltage", Role.INPUT, "V"),
 )
@@ -126,8 +126,8 @@ class PendulumPopulation(Batch[PendulumTruth]):
 
     plant, truth = PendulumTruth.plant, PendulumTruth
     channels = (
-        Channel("position", Role.STATE, "rad", measured=True),
-        Channel("velocity", Role.STATE, "rad/s"),
+        POSITION,
+        VELOCITY,
         Channel("torque", Role.INPUT, "1"),
     )
     noise = (0.01,)  # of velocity, rad/s

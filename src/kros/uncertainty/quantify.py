@@ -23,9 +23,8 @@ from ..core.work import Work
 from ..data.shown import Shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
-from .bounded import bound_responses, bound_systems, choose_nominal
+from .bounded import Options, bound_responses, bound_systems, choose_nominal, read_response_data
 from .forms import Form, as_form, residual
-from .inputs import Options, read_response_data
 from .model import UncertainModel
 from .outliers.model import OutlierModel
 from .outliers.population import score_population

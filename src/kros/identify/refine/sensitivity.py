@@ -95,8 +95,24 @@ class _Run:
         S = np.zeros(
             (2 + max((d for _, _, d in past), default=0), n, n * p, batch)
         )  # now, earlier, and space for the next
-        loops = library()
-        return self._in_numpy(window, S, past) if loops is None else self._compiled(loops, window, S, past)
+        if (loops := library()) is not None:
+            yield from self._compiled(loops, window, S, past)
+            return
+        lifting, nl, h = self.lifting, self.lifting.n_lifted, self.lifting.history
+        psi, recent = np.empty((p, batch)), list(S)
+        psi[:n] = window[:n]
+        for k in range(h, len(self.x) - 1):
+            u = self.u[k]
+            psi[:nl] = lifting.lift(window.T, self.parameters).T
+            psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
+            terms = np.stack([*recent[0], *(recent[delay][state] for _, state, delay in past)])
+            following = np.einsum("abj,bqj->aqj", self._state_matrix(window, u, past), terms)
+            following.reshape(n, n, p, batch)[range(n), range(n)] += self.T.T @ psi
+            window[n:] = lifting.window.advance(window.T, u.T).T
+            psi[:n] = window[:n] = np.einsum("apb,pb->ab", self.W, psi)
+            recent = [following, *recent[:-1]]
+            if (k + 1 - h) % self.stride == 0:
+                yield self._residuals(recent[0], self.x[k + 1] - psi[:n], self.valid[k + 1])
 
     def _compiled(self, loops: Library, window: Array, S: Array, past: Sequence[Past]) -> Iterator[Array]:
         (n, p, batch), lifting, h, m = self.W.shape, self.lifting, self.lifting.history, self.u.shape[1]
@@ -123,23 +139,6 @@ class _Run:
             part = {"first": first, "last": first + count * self.stride, "rows": count, "J": J}
             loops.call("kros_sensitivities", of_lifting, ("sensitivity_job", job | part))
             yield J
-
-    def _in_numpy(self, window: Array, S: Array, past: Sequence[Past]) -> Iterator[Array]:
-        (n, p, batch), lifting, nl, h = self.W.shape, self.lifting, self.lifting.n_lifted, self.lifting.history
-        psi, recent = np.empty((p, batch)), list(S)
-        psi[:n] = window[:n]
-        for k in range(h, len(self.x) - 1):
-            u = self.u[k]
-            psi[:nl] = lifting.lift(window.T, self.parameters).T
-            psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
-            terms = np.stack([*recent[0], *(recent[delay][state] for _, state, delay in past)])
-            following = np.einsum("abj,bqj->aqj", self._state_matrix(window, u, past), terms)
-            following.reshape(n, n, p, batch)[range(n), range(n)] += self.T.T @ psi
-            window[n:] = lifting.window.advance(window.T, u.T).T
-            psi[:n] = window[:n] = np.einsum("apb,pb->ab", self.W, psi)
-            recent = [following, *recent[:-1]]
-            if (k + 1 - h) % self.stride == 0:
-                yield self._residuals(recent[0], self.x[k + 1] - psi[:n], self.valid[k + 1])
 
     def _state_matrix(self, window: Array, u: Array, past: Sequence[Past]) -> Array:
         """F = W d psi/dw, shape (n, n + q, batch)."""

@@ -15,9 +15,8 @@ from ...data import prepare
 from ...data.population import Channel, EpisodeKey, Role
 from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
-from ..batch import OUTLIER_STREAM, BatchSettings, SimulatedEpisodes, SimulatedPopulation, by_unit
-from .dynamics import simulate
-from .parameters import (
+from ..batch import OUTLIER_STREAM, POSITION, VELOCITY, BatchSettings, SimulatedEpisodes, SimulatedPopulation, by_unit
+from .dynamics import (
     CURRENT_NOISE,
     GAINS,
     GEAR_RATIO,
@@ -29,13 +28,14 @@ from .parameters import (
     DriveParameters,
     Gains,
     Loop,
+    simulate,
 )
 from .reference import episode_reference
 
 CONDITIONS = ("noload", "load")
 CHANNELS = (
-    Channel("position", Role.STATE, "rad", measured=True),
-    Channel("velocity", Role.STATE, "rad/s"),
+    POSITION,
+    VELOCITY,
     Channel("current", Role.STATE, "1"),
     Channel("target_position", Role.INPUT, "rad"),
     Channel("target_velocity", Role.INPUT, "rad/s"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...data import EpisodeBatch
-from ...evaluate.validation import correlation
+from ...evaluate.errors import correlation
 from ...identify import ModelSet
 from ...identify.identified import IdentifiedModels
 from ...observer.residual import one_step_residual

@@ -8,8 +8,7 @@ from ...core.arrays import AnyArray
 from ...core.errors import ConfigError
 from ...data.population import EpisodeKey, Population, Role
 from ...data.recording import some
-from ...evaluate.errors import error_spectrum
-from ...evaluate.validation import excitation
+from ...evaluate.errors import error_spectrum, excitation
 from ...identify import PhaseCalibration
 from ..canvas import Figure, frequency_axis, grid, label_below, legend, logarithmic, name_units, note, units_axis
 from ..names import Look, episode_title, minus, squared, words

@@ -301,7 +301,7 @@ class ObserverProblem:
         A, B, C, W_p = self.scaled
         n, m, q, eye, dt = len(A), B.shape[1], len(C), np.eye, self.nominal.dt
         sizes = np.concatenate([self.noise, self.output_scale, self.input_scale])
-        filters = _scaled(estimate, 1 / self.output_scale, sizes)
+        filters = multiplied(estimate, 1 / self.output_scale, sizes)
         truth = np.vstack([C, eye(n), np.zeros((m, n))])
         columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
         plant = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt)
@@ -320,14 +320,14 @@ class ObserverProblem:
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
         correction, noise = self._scales
-        return _scaled(controller, 1 / correction, noise)
+        return multiplied(controller, 1 / correction, noise)
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
         correction, noise = self._scales
-        return _scaled(controller, correction, 1 / noise)
+        return multiplied(controller, correction, 1 / noise)
 
 
-def _scaled(system: StateSpace, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
+def multiplied(system: StateSpace, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
     """Return a system with outputs and inputs multiplied."""
     return replace(system, B=system.B * inputs, C=outputs[:, None] * system.C, D=outputs[:, None] * system.D * inputs)

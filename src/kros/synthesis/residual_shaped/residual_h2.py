@@ -79,8 +79,8 @@ class Basis:
 
     def system(self, n: int) -> tuple[AnyArray, AnyArray]:
         """Return A_z and B_z for n channels, the channels of one delay or lag side by side."""
-        (A, b), size = self.scalar, n * self.size
-        return np.kron(A, np.eye(n)).reshape(size, size), np.kron(b[:, None], np.eye(n)).reshape(size, n)
+        A, b = self.scalar
+        return np.kron(A, np.eye(n)), np.kron(b[:, None], np.eye(n))
 
 
 def circle_weights(f: int) -> AnyArray:
@@ -103,9 +103,9 @@ def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
     k = basis.size
     blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
     floor = np.einsum("f,fa,fb->ab", weight, response, response.conj()).real
-    G = blocks.reshape(k * n, k * n) + _FLOOR * largest * np.kron(floor, np.eye(n)).reshape(k * n, k * n)
+    G = blocks.reshape(k * n, k * n) + _FLOOR * largest * np.kron(floor, np.eye(n))
     cross = np.einsum("f,fb,fij->ibj", weight, response.conj(), spectrum, optimize=True).real.reshape(n, k * n)
-    cross = cross + _FLOOR * largest * np.kron(weight @ response.conj().real, np.eye(n)).reshape(n, k * n)
+    cross = cross + _FLOOR * largest * np.kron(weight @ response.conj().real, np.eye(n))
     Theta = np.linalg.solve(G, cross.T).T if k else cross
     innovation = R - Theta @ cross.T
     values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)

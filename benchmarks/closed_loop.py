@@ -20,7 +20,7 @@ import numpy as np
 from kros.core import StateSpace, block_diagonal, hinf_norm
 from kros.data import EpisodeBatch
 from kros.observer import Observer
-from kros.synthesis.problem.interconnect import interconnect
+from kros.synthesis.generalized_plant import interconnect
 from kros.uncertainty.quantify import UncertainModels
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "closed_loop"))

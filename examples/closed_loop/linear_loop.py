@@ -24,7 +24,7 @@ from kros.observer.data import ObserverData
 from kros.observer.estimator.certificate import linear_part
 from kros.observer.sensor import delay_of
 from kros.synthesis import ObserverProblem
-from kros.synthesis.problem.interconnect import interconnect
+from kros.synthesis.generalized_plant import interconnect
 from kros.uncertainty import UncertainModel
 
 

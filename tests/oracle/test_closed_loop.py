@@ -15,7 +15,7 @@ import kros
 from kros.core import ConfigError, StateSpace, SynthesisError, block_diagonal, gain, hinf_norm
 from kros.observer import Observer, Runtime
 from kros.synthesis import ObserverProblem
-from kros.synthesis.problem.interconnect import interconnect
+from kros.synthesis.generalized_plant import interconnect
 from kros.uncertainty import Form, rebuild
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "closed_loop"))

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.dynamics import GAINS, VELOCITY_POLE, DriveParameters, Loop, Physics, simulate
-from kros.plants.harmonic_drive.reference import MAX_SPEED
+from kros.plants.harmonic_drive.population import MAX_SPEED
 
 PERIOD = 1e-3
 TURN = 20  # samples of a motor revolution at full speed

@@ -237,16 +237,16 @@ _TOGETHER = 32  # episodes, as many as the compiled loop runs side by side
 
 
 def free_run_errors(
-    models: KoopmanMatrices,
-    lifting: Lifting,
-    parameters: Mapping[str, Array],
-    population: Population,
-    keys: Sequence[EpisodeKey],
+    data: TrainingData, models: KoopmanMatrices, rows: Sequence[int], keys: Sequence[EpisodeKey]
 ) -> tuple[Array, Array]:
-    """Return RMS errors of free runs, and the largest values that they reach, both (episode, n)."""
+    """Return RMS errors of free runs over episodes of some rows of the data, and the largest values, both (episode, n).
+
+    There is a model for every episode.
+    """
+    lifting, parameters = data.lifting, {name: given[rows] for name, given in data.parameters.items()}
     errors = []
     for part in (slice(start, start + _TOGETHER) for start in range(0, len(keys), _TOGETHER)):
-        batch = EpisodeBatch.read(population, keys[part])
+        batch = EpisodeBatch.read(data.population, keys[part])
         values = {name: given[part] for name, given in parameters.items()}
         x, u = (np.ascontiguousarray(np.swapaxes(signal, 0, 1)) for signal in (batch.states, batch.inputs))
         runs = free_run(models.A[part], models.B[part], lifting, values, x[:, : lifting.history + 1], u)
@@ -263,9 +263,7 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
     """Refuse models whose free runs over a training episode leave the bound, in ranges of the states."""
     rows = [row for row, episodes in enumerate(data.keys.values()) for _ in episodes]
     keys = [key for episodes in data.keys.values() for key in episodes]
-    values = {name: given[rows] for name, given in data.parameters.items()}
-    each = KoopmanMatrices(models.A[rows], models.B[rows])
-    _, reached = free_run_errors(each, data.lifting, values, data.population, keys)
+    _, reached = free_run_errors(data, KoopmanMatrices(models.A[rows], models.B[rows]), rows, keys)
     for which, state in np.argwhere(~(reached <= bound)):
         size = f"{reached[which, state]:.3g} times the range of {data.lifting.states[state]!r}, beyond {bound:g}"
         remedy = "use functions that stay bounded, drop the episode, or set identify.refine = false"
@@ -277,6 +275,5 @@ def trade_off(data: TrainingData, problem: RefinementProblem, V: Array) -> tuple
     rows, count = data.rows, len(data.keys)
     models = problem.matrices(np.broadcast_to(V, (count, *V.shape[-2:]))[rows])
     last = [episodes[-1] for episodes in data.keys.values()]
-    values = {name: given[rows] for name, given in data.parameters.items()}
-    rms, _ = free_run_errors(models, data.lifting, values, data.population, [last[row] for row in rows])
+    rms, _ = free_run_errors(data, models, rows.tolist(), [last[row] for row in rows])
     return float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)

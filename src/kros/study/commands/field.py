@@ -20,7 +20,7 @@ from ...core.rounding import AGREED
 from ...data import Population, read
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
-from ...evaluate.sensor import Arriving, arriving
+from ...evaluate.held_out import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibration import Texts, Values, unit_values
 from ...identify.survey import RecordingFacts

@@ -20,7 +20,7 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
-from ...evaluate.sensor import as_arriving
+from ...evaluate.held_out import as_arriving
 from ...lifting import Lifting
 from ...motor_drive import AngleLoad
 from ...motor_drive.observer import LoadSettings, load_observer

@@ -54,9 +54,8 @@ from ...core.rounding import AGREED, TINY
 from ...core.settings import member
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
-from ..generalized_plant import GeneralizedPlant
+from ..generalized_plant import GeneralizedPlant, interconnect
 from ..result import Injection
-from .interconnect import interconnect
 
 if TYPE_CHECKING:
     from ...identify.model_set import ModelSet

@@ -30,8 +30,7 @@ import numpy as np
 
 from ...core.arrays import AnyArray
 from ...core.lti import StateSpace, block_diagonal, gain
-from ..generalized_plant import GeneralizedPlant, split
-from .interconnect import interconnect
+from ..generalized_plant import GeneralizedPlant, interconnect, split
 from .observer_problem import ObserverProblem
 
 # In matrix inequalities: share of the measured channel's range, weight of the scaled correction.

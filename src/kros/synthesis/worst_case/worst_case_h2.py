@@ -49,13 +49,12 @@ from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.rounding import ROUNDING
 from ...uncertainty import fit_magnitude
-from ..problem.interconnect import interconnect
+from ..generalized_plant import interconnect
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import disturbed, shaped_plant
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.h2 import predictor, predictor_bound
-from .ball import uncertain_ball
-from .certificate import certified
+from .certificate import certified, uncertain_ball
 
 
 def worst_case_h2(

@@ -74,7 +74,7 @@ class LinearLoop:
 
 def perturbed_plant(problem: ObserverProblem) -> tuple[StateSpace, list[tuple[int, int]]]:
     """Return the scaled nominal with its weights, from (w, u) to (z, x), and the signals (w, z) of every block."""
-    place, G, left, right = problem.location, problem.scaled_model, problem.W_L, problem.W_R
+    place, G, left, right = problem.form, problem.scaled_model, problem.W_L, problem.W_R
     u, x = np.eye(G.n_inputs), np.eye(G.n_outputs)
     effect = {"W_L": np.eye(left.n_outputs)}
     seen = {"u": u} if place.sees_input else {"G": x}

@@ -81,7 +81,7 @@ def connected(case, estimate, true):
 def member(case, E):
     """Return the plant that static E makes of NOMINAL, in physical units."""
     x, u, eye = np.diag(case.output_scale), np.diag(case.input_scale), np.eye
-    location = case.location
+    location = case.form
     E = (x if not location.at_input else u) @ E @ np.linalg.inv(u if location.sees_input else x)
     if case.form is Form.ADDITIVE:
         return StateSpace(A, B, eye(3), E, DT)

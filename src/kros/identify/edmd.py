@@ -5,11 +5,6 @@
 is solved by QR of ``[R; sqrt(alpha) I]``, with `alpha` added to the unnormalised Gram matrix as in the paper and in
 pykoop.
 
-Symbols
--------
-R11, R12 : blocks of the factor of [Psi | Theta_plus]
-U        : Koopman matrix [A B], (n_lifted, n_lifted + m)
-
 Uncertainty of the estimate itself: models of resampled episodes, from what each episode was reduced to.
 
     per-episode factors --draw episodes--> weighted restacking --EDMD--> samples of (A, B)
@@ -21,6 +16,8 @@ all episodes share is not seen.
 
 Symbols
 -------
+R11, R12 : blocks of the factor of [Psi | Theta_plus]
+U        : Koopman matrix [A B], (n_lifted, n_lifted + m)
 w : weights of the episodes, (unit, draw, episode)
 """
 

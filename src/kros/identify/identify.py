@@ -105,19 +105,10 @@ def identify(
 
 
 def with_models(base: IdentifiedModels, settings: IdentifySettings, work: Work) -> IdentifiedModels:
-    """Return surveyed recordings, with a known lifting and its calibration, with their models."""
-    _check_conditions(base)
-    begun = {c: _begin(base, c, settings, work) for c in base.conditions}  # refined while others are identified
-    sets, factors = dict[str, ModelSet](), dict[str, EpisodeFactors]()
-    for condition, (recorded, models, refining) in begun.items():
-        factors[condition] = recorded
-        sets |= {base.place(m.name, condition): m for m in (*models, *refining())}
-    kinds = kinds_for(base.lifting, refined=settings.refine)
-    return replace(base, kinds=tuple(kinds), sets=sets, factors=factors)
+    """Return surveyed recordings, with a known lifting and its calibration, with their models.
 
-
-def _check_conditions(base: IdentifiedModels) -> None:
-    """Refuse a condition without units, and say which units were not recorded in the one that feeds synthesis."""
+    A condition without units is refused; the log names units that were not recorded in the one that feeds synthesis.
+    """
     facts = base.facts
     if facts.identify_on not in base.conditions:
         raise IdentificationError(
@@ -128,6 +119,13 @@ def _check_conditions(base: IdentifiedModels) -> None:
     if elsewhere:
         text = "Units %s were not recorded in condition %r, which feeds synthesis, and take no part in it"
         log.warning(text, ", ".join(elsewhere), facts.identify_on)
+    begun = {c: _begin(base, c, settings, work) for c in base.conditions}  # refined while others are identified
+    sets, factors = dict[str, ModelSet](), dict[str, EpisodeFactors]()
+    for condition, (recorded, models, refining) in begun.items():
+        factors[condition] = recorded
+        sets |= {base.place(m.name, condition): m for m in (*models, *refining())}
+    kinds = kinds_for(base.lifting, refined=settings.refine)
+    return replace(base, kinds=tuple(kinds), sets=sets, factors=factors)
 
 
 def _begin(

@@ -158,7 +158,13 @@ def survey(
             "read", _read_group, tasks, marks, _GroupFacts, lambda _, known: copy is None or copy.reuse(known)
         )
     )
-    retained = _retained(population, groups, folder)
+    if folder is None:
+        digests = {e.key: e.digest for group in groups for e in group.episodes}
+        refuse_copies(digests.items())
+        retained = replace(population, episodes=tuple(k for k in population.episodes if k in digests))
+    else:
+        write_index(population, [g.record for g in groups if g.record is not None], folder, converted=False)
+        retained = read_parquet(folder)
     facts = _facts(population, retained, groups, chosen)
     for alert in facts.alerts:
         log.warning("%s", alert)
@@ -235,13 +241,3 @@ def smallest_step(signal: Array) -> float:
     steps, floor = np.abs(np.diff(signal)), ITERATED * float(np.abs(signal).max())
     smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
     return smallest if np.isfinite(smallest) else floor
-
-
-def _retained(population: Population, groups: Sequence[_GroupFacts], folder: Path | None) -> Population:
-    """Return the population of usable episodes, that of the copy where there is one."""
-    if folder is not None:
-        write_index(population, [g.record for g in groups if g.record is not None], folder, converted=False)
-        return read_parquet(folder)
-    digests = {e.key: e.digest for group in groups for e in group.episodes}
-    refuse_copies(digests.items())
-    return replace(population, episodes=tuple(k for k in population.episodes if k in digests))

@@ -1,14 +1,11 @@
 r"""The generalized plant of Figure 1, and its closure with a controller.
 
-Symbols
--------
-x : state, (n,);  w : disturbances, (n_w,);  u : control, (n_u,);  z : performance, (n_z,);  y : measurements, (n_y,)
-K : controller with matrices A^c, B^c, C^c, D^c
-
 Interconnection of systems by named wires: every block once, so that no state is there twice.
 
 Symbols
 -------
+x : state, (n,);  w : disturbances, (n_w,);  u : control, (n_u,);  z : performance, (n_z,);  y : measurements, (n_y,)
+K : controller with matrices A^c, B^c, C^c, D^c
 x, v, y : states, inputs and outputs of all blocks, stacked;  w, z : inputs and outputs of the whole
 F, H, P, Q : ``v = F y + H w``,  ``z = P y + Q w``
 """

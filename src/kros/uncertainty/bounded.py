@@ -209,7 +209,7 @@ def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
     system = stack_systems(models)
     if not system.dt > 0:
         raise ConfigError("Quantify: continuous systems have no weights; sample them, control.sample_system does it.")
-    require_stable(system, tuple(f"unit {name}" for name in options.ids(system.batch_shape[0])))
+    require_stable(system, options.ids(system.batch_shape[0]))
     return system, options
 
 
@@ -255,9 +255,11 @@ def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     for k, name in enumerate(names):
         one = system[k]
         if not all(np.isfinite(getattr(one, matrix)).all() for matrix in "ABCD"):
-            raise DataError(f"Quantify: the model of {name} has NaN or infinity; leave it out or identify it again.")
+            raise DataError(
+                f"Quantify: the model of unit {name} has NaN or infinity; leave it out or identify it again."
+            )
         if not one.is_stable():
-            problem = f"the model of {name} is unstable (spectral radius {one.spectral_radius():.6f})"
+            problem = f"the model of unit {name} is unstable (spectral radius {one.spectral_radius():.6f})"
             raise DataError(f"Quantify: {problem}; identify with more regularisation or leave it out.")
 
 

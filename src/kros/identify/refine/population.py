@@ -28,7 +28,7 @@ from ..free_run import free_run
 from .metric import ResponsePrior, peak_residual
 from .problem import OneStep, RefinementProblem, stability_barrier
 from .search import GaussNewton, RefineOptions, Solution
-from .segments import Segments, TrainingData, held_segments, read_segments
+from .sensitivity import Segments, TrainingData, held_segments, read_segments
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,12 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     final = replace(problem, segments=segments).with_prior(strength)
     solution = _fit(final, path[choice], replace(options.search, iterations=options.final_iterations))
     models = final.matrices(solution.V)
-    _require_stable(tuple(data.keys), models.spectral_radius(), options.margin)
+    for unit, radius in zip(data.keys, models.spectral_radius(), strict=True):
+        if not radius < 1 - options.margin:
+            raise IdentificationError(
+                f"Refinement: the model of unit {unit} has spectral radius {radius_text(radius)}, not below "
+                f"{radius_text(1 - options.margin)}; use a stronger prior."
+            )
     require_bounded(data, models, options.bound)
     return models
 
@@ -155,15 +160,6 @@ def _choose(scores: Array, peaks: Array, options: RefineOptions) -> int:
     choice = int(np.argmax(scores <= (1 + options.tolerance) * best))
     free = [i for i in range(choice, len(scores)) if peaks[i] <= options.negligible_residual]
     return min(free, key=lambda i: scores[i], default=choice)
-
-
-def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> None:
-    for unit, value in zip(unit_ids, radius, strict=True):
-        if not value < 1 - margin:
-            raise IdentificationError(
-                f"Refinement: the model of unit {unit} has spectral radius {radius_text(value)}, not below "
-                f"{radius_text(1 - margin)}; use a stronger prior."
-            )
 
 
 def start_pooled(data: TrainingData, segments: Segments, options: RefineOptions) -> tuple[Array, RefinementProblem]:

@@ -32,8 +32,7 @@ from ..edmd import KoopmanMatrices
 from ..factors import Factor
 from .metric import ResponsePrior
 from .search import RefineOptions
-from .segments import Segments
-from .sensitivity import Normal, normal_equations
+from .sensitivity import Normal, Segments, normal_equations
 
 
 @frozen

@@ -7,12 +7,6 @@
 The linear part is integrated exactly over a substep (matrix exponential); friction `F`, disturbance `i_d` and gravity
 are held, evaluated at the predicted middle of the substep.
 
-Symbols
--------
-q, w : motor angle and velocity / gear ratio;   s : gear twist;   w_l : flange velocity;   i, u : current and its
-command p, v : position and velocity that the drive measures z : [s, w, w_l, i, u, f_m, f_l], shape (7, n);   M : map
-from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
-
 What a drive is made of, its software, and how the drives of a batch differ.
 
 target position --> (+) --> Kp --> (+) --> PI --> limit --> current
@@ -21,6 +15,12 @@ target position --> (+) --> Kp --> (+) --> PI --> limit --> current
 
 All mechanical quantities are referred to the gearbox output. Draws are log-normal around the nominal value; phases
 are uniform. Each unit has its own random stream, so that unit `k` is the same whatever the number of units.
+
+Symbols
+-------
+q, w : motor angle and velocity / gear ratio;   s : gear twist;   w_l : flange velocity;   i, u : current and its
+command p, v : position and velocity that the drive measures z : [s, w, w_l, i, u, f_m, f_l], shape (7, n);   M : map
+from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
 """
 
 from __future__ import annotations

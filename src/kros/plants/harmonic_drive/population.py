@@ -55,7 +55,10 @@ def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int, peri
     """Return target position and velocity of an episode, each of shape (n_rest + n_samples,), in rad and rad/s."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(REFERENCE_STREAM, episode)))
     checkpoints = _draw_checkpoints(rng, n_samples, period_s)
-    starts = _start_times(rng, checkpoints, n_samples, period_s) + n_rest
+    durations = _durations(checkpoints, period_s)
+    spare = n_samples - SETTLE_SAMPLES - durations.sum()  # spread as rests at the checkpoints
+    rests = spare * rng.dirichlet(np.ones(len(durations) + 1))[:-1]
+    starts = SETTLE_SAMPLES + np.cumsum(rests) + np.concatenate([[0.0], np.cumsum(durations[:-1])]) + n_rest
     return profile(checkpoints, starts, n_rest + n_samples, period_s)
 
 
@@ -65,18 +68,12 @@ def profile(checkpoints: Array, starts: Array, n_samples: int, period_s: float) 
     knots = np.stack([starts, starts + lengths], axis=1).ravel()
     ramp = np.interp(np.arange(-_RAMPS, n_samples + 1), knots, np.repeat(checkpoints, 2)[1:-1])
     for length in (ACCELERATION_SAMPLES, JERK_SAMPLES):
-        ramp = _moving_average(ramp, length)
+        total = np.cumsum(np.concatenate([np.zeros(length), ramp - ramp[0]]))  # before the start its value is held
+        ramp = ramp[0] + (total[length:] - total[:-length]) / length
     position = ramp[_RAMPS:]
     velocity = np.diff(ramp[_RAMPS - 1 :])
     velocity = 0.5 * (velocity[:-1] + velocity[1:]) / period_s
     return position[:-1].copy(), velocity
-
-
-def _moving_average(values: Array, length: int) -> Array:
-    """Causal moving average; before the start the first value is held."""
-    padded = np.concatenate([np.full(length, values[0]), values])
-    total = np.cumsum(padded - values[0])
-    return values[0] + (total[length:] - total[:-length]) / length
 
 
 def _durations(checkpoints: Array, period_s: float) -> Array:
@@ -116,14 +113,6 @@ def _fits(drawn: Array, n_samples: int, period_s: float) -> Flags:
     held = _RAMPS + LEAST_HOLD_SAMPLES
     both = (moves.max(axis=1) >= held) & (moves.min(axis=1) <= -held)
     return (total <= n_samples) & (total >= LEAST_IN_MOTION * n_samples) & both
-
-
-def _start_times(rng: np.random.Generator, checkpoints: Array, n_samples: int, period_s: float) -> Array:
-    """Spread the time that is left over as rests at the checkpoints."""
-    durations = _durations(checkpoints, period_s)
-    spare = n_samples - SETTLE_SAMPLES - durations.sum()
-    rests = spare * rng.dirichlet(np.ones(len(durations) + 1))[:-1]
-    return SETTLE_SAMPLES + np.cumsum(rests) + np.concatenate([[0.0], np.cumsum(durations[:-1])])
 
 
 CONDITIONS = ("noload", "load")
@@ -215,7 +204,10 @@ class HarmonicDrivePopulation(BatchSettings):
         inputs = [np.stack(episode_reference(self.seed, e, *samples)) for e in range(self.n_episodes)]
         position, velocity = np.stack(inputs, axis=1)
         states, true, torque = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
-        self._disturb(states, keys)
+        for i, key in enumerate(keys):  # what the recording adds: an offset of the position, noise on the current
+            rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
+            states[i, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
+            states[i, 2] += CURRENT_NOISE * rng.standard_normal(states.shape[-1])
         parts = {key: (states[i], inputs[episode[i]], true[i]) for i, key in enumerate(keys)}
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
@@ -230,10 +222,3 @@ class HarmonicDrivePopulation(BatchSettings):
             "ripple": RIPPLE * np.exp(self.spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))
         }
         return ripple | {"phase_rad": rng.uniform(0.0, 2 * np.pi, len(RIPPLE))}
-
-    def _disturb(self, states: AnyArray, keys: tuple[EpisodeKey, ...]) -> None:
-        """Add what the recording adds: an offset of the position in each episode, noise on the current."""
-        for row, key in enumerate(keys):
-            rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
-            states[row, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
-            states[row, 2] += CURRENT_NOISE * rng.standard_normal(states.shape[-1])

@@ -23,13 +23,13 @@ the rows are combined accordingly (a congruence):
 In balanced coordinates G~ has the diagonal (s, s); rows and columns are
 divided by its root.
 
-References
-----------
-C. Scherer, P. Gahinet, M. Chilali, IEEE Trans. Automatic Control 42 (1997) 896-911.
-
 Symbols
 -------
 X, Y, A_n, B_n, C_n, D_n, Z : the variables
+
+References
+----------
+C. Scherer, P. Gahinet, M. Chilali, IEEE Trans. Automatic Control 42 (1997) 896-911.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem, multiplied
 from ..problem.plants import mixed_plant
 from ..result import Status, Synthesis
-from ..riccati.equations import balancing
-from ..riccati.h2 import h2
+from ..riccati.h2 import balancing, h2
 from ..worst_case.certificate import certified
 from .barrier import Block, Ending, minimise
 

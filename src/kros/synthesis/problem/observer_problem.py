@@ -98,7 +98,7 @@ class ObserverProblem:
     remainder_right: StateSpace | None = None  # (m, m), right weight of it on scaled inputs
     injection: Injection = Injection.STATE  # where the correction enters
     process_noise: AnyArray | None = None  # (n,), standard deviation of white noise on every state per sample
-    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE  # of the uncertainty
+    form: Form = Form.INVERSE_INPUT_MULTIPLICATIVE  # of the uncertainty, or its name
 
     def __post_init__(self) -> None:
         put = partial(object.__setattr__, self)
@@ -130,7 +130,7 @@ class ObserverProblem:
     def _check_weights(self) -> None:
         """Refuse weights whose sizes or sampling periods do not fit; None is any size."""
         n, m, dt = self.nominal.n_states, self.nominal.n_inputs, self.nominal.dt
-        rows, columns = self.location.sizes(n, m)
+        rows, columns = self.form.sizes(n, m)
         sizes = (rows, None), (None, columns), (m, m), (n, None), (None, m)
         for name, (height, width) in zip(_WEIGHTS, sizes, strict=True):
             if getattr(self, name) is not None:
@@ -138,7 +138,7 @@ class ObserverProblem:
                 object.__setattr__(self, name, weight)
                 size = weight.n_outputs, weight.n_inputs
                 fits = size == (height or size[0], width or size[1]) and not weight.batch_shape
-                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {self.location.value}"
+                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {self.form.value}"
                 shape = f"{size[0]} x {size[1]}{weight.batch_shape or ''}"
                 self._require(fits, f"{wanted} uncertainty, found {shape}")
                 self._require(weight.dt == dt, f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s")
@@ -187,11 +187,6 @@ class ObserverProblem:
         return case
 
     @property
-    def location(self) -> Form:
-        """The form: where the perturbation acts and what it sees."""
-        return Form(self.form)
-
-    @property
     def input_weight(self) -> StateSpace:
         """W_u, the identity unless given."""
         return self.W_u if self.W_u is not None else gain(np.eye(self.nominal.n_inputs), self.nominal.dt)
@@ -219,12 +214,12 @@ class ObserverProblem:
     def M(self) -> StateSpace:  # noqa: N802
         """From the disturbance w1 to what Delta sees."""
         seen = self.input_weight
-        return self.W_R @ (seen if self.location.sees_input else self.scaled_model @ seen)
+        return self.W_R @ (seen if self.form.sees_input else self.scaled_model @ seen)
 
     @cached_property
     def N(self) -> StateSpace:  # noqa: N802
         """From what Delta does to what it sees; zero for the forms without a loop."""
-        form, G = self.location, self.scaled_model
+        form, G = self.form, self.scaled_model
         if not form.inverse:
             return gain(np.zeros((self.W_R.n_outputs, self.W_L.n_inputs)), self.nominal.dt)
         return self.W_R @ (self.W_L if form.at_input is form.sees_input else G @ self.W_L)
@@ -264,7 +259,7 @@ class ObserverProblem:
         if size >= 1:
             raise SynthesisError(
                 f"Observer synthesis: ||N|| = {size:.6g} should be below 1 for "
-                f"{self.location.value.replace('_', ' ')} uncertainty, otherwise the set contains ill-posed "
+                f"{self.form.value.replace('_', ' ')} uncertainty, otherwise the set contains ill-posed "
                 "plants; choose another form or nominal, or leave outliers out."
             )
         return size

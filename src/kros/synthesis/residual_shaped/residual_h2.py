@@ -43,8 +43,7 @@ from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import gramian, gramian_root, h2_norm
 from ...core.rounding import ITERATED, ROUNDING, TINY
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.equations import balancing
-from ..riccati.h2 import kalman, predictor_bound
+from ..riccati.h2 import balancing, kalman, predictor_bound
 
 _FLOOR = ROUNDING  # white noise of every channel, relative to the largest, which keeps the Gramian regular
 

@@ -9,15 +9,15 @@ What is attained is always a norm that was computed from a closed loop. Out of r
 prove (`parrott`), or a level whose necessary conditions fail by more than rounding. A level for which the equations
 have no solution proves nothing.
 
-Symbols
--------
-gamma : level;  K : controller
-
 Lower bounds of the H-infinity problem at single frequencies (Parrott's theorem).
 
 Signals ``(s I - A) x = B w, C_y x + D_y w = 0`` reach z whatever the controller does, so that ``||T|| >= |C x + D w| /
 |w|``, and alike for the transposed plant. For a regular plant and a level above the bounds of all frequencies, both
 Riccati equations of `hinf_level` have stabilising solutions.
+
+Symbols
+-------
+gamma : level;  K : controller
 """
 
 from __future__ import annotations
@@ -86,7 +86,24 @@ def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
     best, lower = (idle, idle.norm) if trivial else _search(Frame.of(plant), idle, tolerance, negligible)
     lower = 0.0 if best.norm <= negligible else lower
     optimal = best.norm <= max(negligible, lower * (1 + tolerance) * (1 + 2 * AGREED))
-    return _result(plant, best, lower, optimal, time.perf_counter() - start)
+    if best.K is None:
+        remedy = "scale states, inputs and outputs to similar size, or raise noise and penalty"
+        raise SynthesisError(f"H-infinity synthesis: no level was attained; {remedy}.")
+    lower_bound, gap, notes = enclosed(best.norm, lower)
+    closed = plant.close(best.K)
+    return Synthesis(
+        method="hinf",
+        controller=best.K,
+        status=Status.OPTIMAL if optimal else Status.CERTIFIED,
+        h2_norm=h2_norm(closed),
+        hinf_norm=best.norm,
+        lower_bound=lower_bound,
+        gap_percent=gap,
+        spectral_radius=closed.largest_pole(),
+        solve_s=time.perf_counter() - start,
+        solver="riccati",
+        notes=notes,
+    )
 
 
 @frozen
@@ -126,28 +143,6 @@ def _search(frame: Frame, idle: _Loop, tolerance: float, negligible: float) -> t
         lower = level if failed else lower
         level *= 4
     return best, lower if lower <= best.norm else proven  # rounding had its say where levels and norms disagree
-
-
-def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, elapsed: float) -> Synthesis:
-    """Recompute the rest; the gap follows from the norm and the bound."""
-    if best.K is None:
-        remedy = "scale states, inputs and outputs to similar size, or raise noise and penalty"
-        raise SynthesisError(f"H-infinity synthesis: no level was attained; {remedy}.")
-    lower_bound, gap, notes = enclosed(best.norm, lower)
-    closed = plant.close(best.K)
-    return Synthesis(
-        method="hinf",
-        controller=best.K,
-        status=Status.OPTIMAL if optimal else Status.CERTIFIED,
-        h2_norm=h2_norm(closed),
-        hinf_norm=best.norm,
-        lower_bound=lower_bound,
-        gap_percent=gap,
-        spectral_radius=closed.largest_pole(),
-        solve_s=elapsed,
-        solver="riccati",
-        notes=notes,
-    )
 
 
 _RANK = float(np.sqrt(EPS))  # relative: signals that are smaller prove nothing

@@ -32,7 +32,7 @@ from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ...core.rounding import EPS, SINGULAR, TINY
 from ..generalized_plant import GeneralizedPlant, split
-from .equations import absorb_feedthrough, balancing, riccati_pair
+from .h2 import absorb_feedthrough, balancing, riccati_pair
 
 _DOUBT = float(np.sqrt(EPS))  # relative: conditions that hold or fail by less than this decide nothing
 

@@ -213,7 +213,7 @@ def _responses(
     m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response = errors.frequency_response(freqs_hz)
     d, r, noise, s = np.split(response, [m, m + n, m + 2 * n + len(problem.C)], axis=-1)
-    T = (d if problem.location.at_input else r) @ problem.W_L.frequency_response(freqs_hz)
+    T = (d if problem.form.at_input else r) @ problem.W_L.frequency_response(freqs_hz)
     certain = s @ problem.input_weight.frequency_response(freqs_hz) if s.size else 0.0
     return r, T, certain, np.sum(np.abs(noise) ** 2, axis=(-2, -1))
 
@@ -244,7 +244,10 @@ def _mean_square(problem: ObserverProblem, errors: StateSpace, of: Density, rtol
         radius = float(errors.spectral_radius())
         raise SynthesisError(f"Certificate: the nominal loop has spectral radius {radius:.9g}; no bound is finite.")
     rate = 2 * np.pi * problem.nominal.dt
-    return circle_mean(lambda theta: of(problem, errors, theta / rate), _log_poles(problem, errors), rtol)
+    systems = [errors, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
+    poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
+    poles = poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]
+    return circle_mean(lambda theta: of(problem, errors, theta / rate), np.log(poles), rtol)
 
 
 def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> Synthesis:
@@ -262,14 +265,6 @@ def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> 
         spectral_radius=loop.largest_pole(),
         solver="riccati",
     )
-
-
-def _log_poles(problem: ObserverProblem, loop: StateSpace) -> AnyArray:
-    """Logarithms of all poles, in the upper half plane."""
-    systems = [loop, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
-    poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
-    poles = poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]
-    return np.log(poles)
 
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)

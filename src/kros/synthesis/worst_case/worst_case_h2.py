@@ -107,22 +107,18 @@ def worst_case_h2(
     controller = design(problem, *shaped)
     elapsed = time.perf_counter() - start
     if not bounded:
-        return _design_alone(problem, controller)
+        radius = problem.error_system(controller).largest_pole()
+        if radius >= 1:
+            loop = f"the loop has spectral radius {radius:.9g}"
+            raise SynthesisError(f"Worst-case H2 synthesis: {loop}; add noise, or lower the order of the weights.")
+        about = Status.INACCURATE, problem.injection
+        alone = Synthesis("worst_case_h2", controller, *about, spectral_radius=radius, solver="riccati")
+        return replace(alone, notes=("A design alone, without certificate.",))
     candidates = [certified(problem, K, "worst_case_h2") for K in (problem.nothing, controller)]
     best = min(candidates, key=lambda candidate: candidate.worst_case_h2 or 0.0)
     lower, gap, notes = enclosed(best.worst_case_h2 or 0.0, lower_bound(problem))
     note = "The spectral radius is that of the nominal loop and says nothing about robustness, worst_case_h2 does."
     return replace(best, lower_bound=lower, gap_percent=gap, solve_s=elapsed, notes=(note, *notes))
-
-
-def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis:
-    radius = problem.error_system(controller).largest_pole()
-    if radius >= 1:
-        loop = f"the loop has spectral radius {radius:.9g}"
-        raise SynthesisError(f"Worst-case H2 synthesis: {loop}; add noise, or lower the order of the weights.")
-    notes = ("A design alone, without certificate.",)
-    alone = Synthesis("worst_case_h2", controller, Status.INACCURATE, problem.injection, notes=notes)
-    return replace(alone, spectral_radius=radius, solver="riccati")
 
 
 def design(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpace:

@@ -107,12 +107,7 @@ def bound_responses(
     units = Sampled(freqs, G / scales[0][:, None] * scales[1])
     fields = _bound(form, units, freqs, float(dt), ids, options)
     fields |= {"output_scale": scales[0], "input_scale": scales[1], "sample_period_s": float(dt)}
-    certificate = _certificate(freqs, fields["bounds"][form])
-    return ResponseUncertainty(nominal_response=G[fields["nominal"]], certificate=certificate, **fields)
-
-
-def _certificate(freqs: AnyArray, bound: AnyArray) -> str:
-    """Return where a bound of responses holds, and which of its peaks the frequencies do not resolve."""
+    bound = fields["bounds"][form]
     text = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
     middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
     top = (middle >= bound[:-2]) & (middle >= bound[2:])
@@ -121,7 +116,7 @@ def _certificate(freqs: AnyArray, bound: AnyArray) -> str:
         some = ", ".join(f"{f:.4g}" for f in unresolved[:5])
         text += f"; they do not resolve {unresolved.size} peaks of the residuals, at {some} Hz"
         _LOG.warning("Weights of responses: residuals peak between frequencies, at %s Hz; measure more densely.", some)
-    return text
+    return ResponseUncertainty(nominal_response=G[fields["nominal"]], certificate=text, **fields)
 
 
 def _bound(

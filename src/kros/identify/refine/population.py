@@ -96,7 +96,9 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     start, problem = start_pooled(data, fitted, options)
     one_model = problem.of_one_model(data.rows)
     common = refine_pooled(start, one_model)
-    problem = _around(problem, one_model, common)
+    pooled = problem.matrices(common)
+    prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
+    problem = replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
     path, scores, peaks = _path(data, problem, common)
     choice = _choose(scores, peaks, options)
     strength = options.strengths[choice]
@@ -112,13 +114,6 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
             )
     require_bounded(data, models, options.bound)
     return models
-
-
-def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Array) -> RefinementProblem:
-    """Return the problem of all units with errors in units of those of the pooled model, and a prior around it."""
-    options, pooled = problem.options, problem.matrices(common)
-    prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
-    return replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
 
 
 def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], Array, Array]:

@@ -127,7 +127,11 @@ def read_segments(
         earlier, held = max(1, len(episodes) - 1), held_segments(count, keys)
         owners = np.array([*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held])
         for episode in dict.fromkeys(owners.tolist()):
-            samples = _read(population, episodes[episode], history)
+            key = episodes[episode]
+            samples = population.read(key)
+            if len(samples) < history + 2:
+                problem = f"{key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}"
+                raise DataError(f"Refinement: {problem}; leave the episode out or use shorter delays.")
             for column in np.flatnonzero(owners == episode):
                 start = int(rng.integers(0, max(1, len(samples) - length + 1)))
                 piece = samples[start : start + length]
@@ -135,14 +139,6 @@ def read_segments(
                 values[len(piece) :, :, row, column] = piece[-1]
                 valid[len(piece) :, row, column] = False
     return Segments(np.ascontiguousarray(values[:, :n]), np.ascontiguousarray(values[:, n:]), valid, history)
-
-
-def _read(population: Population, key: EpisodeKey, history: int) -> Array:
-    samples = population.read(key)
-    if len(samples) < history + 2:
-        problem = f"{key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}"
-        raise DataError(f"Refinement: {problem}; leave the episode out or use shorter delays.")
-    return samples
 
 
 def held_segments(count: int, keys: Keys) -> int:
@@ -236,7 +232,11 @@ class _Run:
             psi[:n] = window[:n] = np.einsum("apb,pb->ab", self.W, psi)
             recent = [following, *recent[:-1]]
             if (k + 1 - h) % self.stride == 0:
-                yield self._residuals(recent[0], self.x[k + 1] - psi[:n], self.valid[k + 1])
+                error = self.x[k + 1] - psi[:n]
+                rows = np.concatenate([following, error[:, None]], axis=1) / self.sigma[:, None, None]
+                rows[:, :, ~self.valid[k + 1]] = 0.0
+                by_unit = rows.reshape(n, n * p + 1, self.units, batch // self.units).transpose(2, 1, 0, 3)
+                yield by_unit.reshape(self.units, n * p + 1, -1)
 
     def _compiled(self, loops: Library, window: Array, S: Array, past: Sequence[Past]) -> Iterator[Array]:
         (n, p, batch), lifting, h, m = self.W.shape, self.lifting, self.lifting.history, self.u.shape[1]
@@ -277,14 +277,6 @@ class _Run:
             slopes = lifting.slopes(window.T, self.parameters, u=u.T)[..., moving]
             F += np.einsum("afb,bfj->ajb", W[:, nl + len(u) :], slopes)
         return F
-
-    def _residuals(self, S: Array, error: Array, valid: Flags) -> Array:
-        """``[J r]^T`` of one sample; J = dx/dV / sigma."""
-        rows = np.concatenate([S, error[:, None]], axis=1) / self.sigma[:, None, None]  # (n, n p + 1, batch)
-        rows[:, :, ~valid] = 0.0
-        n, width, batch = rows.shape
-        by_unit = rows.reshape(n, width, self.units, batch // self.units).transpose(2, 1, 0, 3)
-        return by_unit.reshape(self.units, width, -1)
 
 
 def _moving_past(lifting: Lifting) -> list[Past]:

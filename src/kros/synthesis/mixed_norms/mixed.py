@@ -39,6 +39,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
+from numpy.linalg import cholesky, inv, solve, svd
 
 from ...core.arrays import AnyArray, frozen
 from ...core.errors import SynthesisError
@@ -204,7 +205,7 @@ class MixedInequalities:
         E, X = P[:n, :n], P.reshape(2, n, 2, n).sum(axis=(0, 2))
         X = X + _KNOWN**2 * np.diag(np.where(np.diag(X) > 0, 0.0, np.diag(X).max(initial=1.0)))
         E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > EPS**2 * np.diag(X), 0.0, np.diag(X)))
-        T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)
+        T, back, s = balancing(cholesky(X), inv(cholesky(E)).T)
         norm, scale = h2_norm(performance.close(K)), np.ones(plant.sizes[3])
         scale[plant.rows(1)] = 1 / max(norm, TINY)
         measurements = np.sqrt(np.diag(plant.C2 @ E @ plant.C2.T + plant.D21 @ plant.D21.T))
@@ -310,12 +311,12 @@ class MixedInequalities:
         p, v = self.plant, self.values(x)
         X, Y, Bn, Cn, Dn = (v[name] for name in ("X", "Y", "Bn", "Cn", "Dn"))
         eye = np.eye(len(X))
-        left, s, right = np.linalg.svd(eye - Y @ X)
+        left, s, right = svd(eye - Y @ X)
         V, U = left * np.sqrt(s), np.sqrt(s)[:, None] * right
-        C = np.linalg.solve(U.T, (Cn - Dn @ p.C2 @ X).T).T
-        B = np.linalg.solve(V, Bn - Y @ p.B2 @ Dn)
+        C = solve(U.T, (Cn - Dn @ p.C2 @ X).T).T
+        B = solve(V, Bn - Y @ p.B2 @ Dn)
         middle = v["An"] + eye - V @ B @ p.C2 @ X - Y @ p.B2 @ C @ U - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
-        A = np.linalg.solve(V, np.linalg.solve(U.T, middle.T).T)
+        A = solve(V, solve(U.T, middle.T).T)
         return multiplied(StateSpace(A, B, C, Dn, p.dt), self.controls, 1 / self.measurements)
 
 

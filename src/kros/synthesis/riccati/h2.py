@@ -34,7 +34,7 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from numpy.linalg import LinAlgError
+from numpy.linalg import LinAlgError, cholesky, cond, eigh, eigvals, eigvalsh, solve, svd
 
 from ...core.arrays import AnyArray, ArrayLike
 from ...core.errors import DimensionError, SynthesisError
@@ -72,14 +72,14 @@ def solve_riccati(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArra
 
 def discrete_gain(A: AnyArray, B: AnyArray, R: AnyArray, S: AnyArray, X: AnyArray) -> AnyArray:
     """Optimal discrete feedback ``F = -(R + B' X B)^-1 (B' X A + S')``."""
-    return -np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
+    return -solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
 
 
 def _residual(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray, X: AnyArray) -> float:
     """Relative residual in the closed-loop (Joseph) form, which does not cancel; infinite for an unstable loop."""
     F = discrete_gain(A, B, R, S, X)
     closed = A + B @ F
-    if np.abs(np.linalg.eigvals(closed)).max() >= 1:
+    if np.abs(eigvals(closed)).max() >= 1:
         return float("inf")
     cost = Q + S @ F + F.T @ S.T + F.T @ R @ F
     # A plant that can be inverted costs nothing, X = 0: what is left is measured against the terms that cancel.
@@ -90,11 +90,11 @@ def _residual(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray, X
 def _doubling(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray) -> AnyArray | None:
     """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, sums of semidefinites."""
     try:
-        RiS, RiB = np.linalg.solve(R, S.T), np.linalg.solve(R, B.T)
+        RiS, RiB = solve(R, S.T), solve(R, B.T)
         Ak, G, H = A - B @ RiS, B @ RiB, Q - S @ RiS
         eye = np.eye(len(A))
         for _ in range(60):
-            W = np.linalg.solve(eye + G @ H, np.hstack([Ak, G]))
+            W = solve(eye + G @ H, np.hstack([Ak, G]))
             WA, WG = W[:, : len(A)], W[:, len(A) :]
             step = Ak.T @ H @ WA
             G = G + Ak @ WG @ Ak.T
@@ -122,9 +122,9 @@ def absorb_feedthrough(K: StateSpace, D22: AnyArray) -> StateSpace:
     if not np.any(D22):
         return K
     loop = np.eye(K.n_outputs) + K.D @ D22
-    if np.linalg.cond(loop) > SINGULAR:
+    if cond(loop) > SINGULAR:
         raise SynthesisError("Algebraic loop: I + D^c D22 is singular; add a delay to the plant, or change D22.")
-    C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
+    C, D = solve(loop, K.C), solve(loop, K.D)
     return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)
 
 
@@ -133,7 +133,7 @@ def balancing(R: AnyArray, S: AnyArray, negligible: float = 0.0) -> tuple[AnyArr
 
     The balanced state is ``left x``. Values below a share of the largest are `negligible`.
     """
-    U, values, Vh = np.linalg.svd(S.T @ R, full_matrices=False)
+    U, values, Vh = svd(S.T @ R, full_matrices=False)
     k = int(np.sum(values > negligible * values.max(initial=0.0)))
     root = np.sqrt(values[:k])
     return (U[:, :k] / root).T @ S.T, R @ Vh[:k].T / root, values[:k]
@@ -202,10 +202,10 @@ def _optimum(p: GeneralizedPlant) -> tuple[StateSpace, float, float]:
     sampled = float(p.dt > 0)  # in continuous time nothing is known of the same moment
     ahead = p.A if sampled else np.eye(len(p.A))
     R, S = p.D12.T @ p.D12 + sampled * (p.B2.T @ X @ p.B2), p.D21 @ p.D21.T + sampled * (p.C2 @ Y @ p.C2.T)
-    F = -np.linalg.solve(R, p.B2.T @ X @ ahead + p.D12.T @ p.C1)
-    F0 = -sampled * np.linalg.solve(R, p.B2.T @ X @ p.B1 + p.D12.T @ p.D11)
-    L = np.linalg.solve(S, p.C2 @ Y @ ahead.T + p.D21 @ p.B1.T).T
-    L0 = sampled * np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T
+    F = -solve(R, p.B2.T @ X @ ahead + p.D12.T @ p.C1)
+    F0 = -sampled * solve(R, p.B2.T @ X @ p.B1 + p.D12.T @ p.D11)
+    L = solve(S, p.C2 @ Y @ ahead.T + p.D21 @ p.B1.T).T
+    L0 = sampled * solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T
     C = F - L0 @ p.C2
     K = StateSpace(p.A - L @ p.C2 + p.B2 @ C, L + p.B2 @ L0, C, L0, p.dt)
     terms = [np.trace(p.D11.T @ p.D11 + p.B1.T @ X @ p.B1), -np.trace(F0.T @ R @ F0)]  # of full information
@@ -256,9 +256,9 @@ def kalman(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, dt: float = 1
     if A.shape != (n, n) or C.shape != (q, n) or Q.shape != (n, n) or R.shape != (q, q):
         shapes = f"{A.shape}, {C.shape}, {Q.shape}, {R.shape}"
         raise DimensionError(f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {shapes}.")
-    if np.linalg.eigvalsh((R + R.T) / 2).min() <= 0:
+    if eigvalsh((R + R.T) / 2).min() <= 0:
         raise SynthesisError("Kalman predictor: R is not positive definite; every measurement needs some noise.")
-    values, vectors = np.linalg.eigh((Q + Q.T) / 2)
+    values, vectors = eigh((Q + Q.T) / 2)
     if values.min() < -ROUNDING * max(values.max(), TINY):
         problem = f"Q has the eigenvalue {values.min():.3g}"
         raise SynthesisError(f"Kalman predictor: {problem}; it must be positive semidefinite.")
@@ -267,11 +267,11 @@ def kalman(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, dt: float = 1
     L, _ = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
     elapsed = time.perf_counter() - start
     closed = A - L @ C
-    radius = float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0))
+    radius = float(np.abs(eigvals(closed)).max(initial=0.0))
     if radius >= 1:
         problem = f"the error dynamics have spectral radius {radius:.9g}"
         raise SynthesisError(f"Kalman predictor: {problem}; add process noise on the modes on the unit circle.")
-    noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
+    noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ cholesky(R)])
     norm = h2_norm(StateSpace(closed, noise, np.eye(n), np.zeros((n, n + q)), dt))
     return Synthesis(
         method="kalman",

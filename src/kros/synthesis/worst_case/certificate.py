@@ -44,6 +44,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.linalg import norm, svd
 
 from ...core.arrays import AnyArray, frozen
 from ...core.errors import SynthesisError
@@ -68,7 +69,7 @@ class Ball:
     @classmethod
     def of(cls, N: AnyArray, M: AnyArray) -> Ball:
         """Build the ball of ``Delta (I - N Delta)^-1 M`` from N (f, a, b) and M (f, a, m)."""
-        U, s, Vh = np.linalg.svd(N)
+        U, s, Vh = svd(N)
         k = s.shape[-1]
         radius = 1 / np.sqrt(1 - s**2)
         X_c = (adjoint(Vh)[..., :k] * (s * radius**2)[..., None, :]) @ adjoint(U)[..., :k, :]
@@ -86,7 +87,7 @@ class Ball:
     def worst(self, T: AnyArray, certain: AnyArray | float = 0.0, iterations: int = 15) -> AnyArray:
         """Contraction of an element that is (locally) worst for ``certain + T X M``, shape (f, b, a)."""
         P, Qh = T @ self.left, adjoint(self.right)
-        left, right = adjoint(np.linalg.svd(P)[2]), np.linalg.svd(self.right)[0]
+        left, right = adjoint(svd(P)[2]), svd(self.right)[0]
         k = min(P.shape[-1], self.right.shape[-2])
         starts = (
             polar(adjoint(self.left) @ self.center @ Qh),  # aligned with the centre
@@ -97,7 +98,7 @@ class Ball:
         for theta in starts:
             for k in range(iterations + 1):
                 error = certain + T @ (self.center + self.left @ theta @ self.right)
-                value = np.linalg.norm(error, axis=(-2, -1))
+                value = norm(error, axis=(-2, -1))
                 better = value > best_value * (1 + AGREED) if k in (0, iterations) else np.zeros_like(value, bool)
                 best = np.where(better[..., None, None], theta, best)
                 best_value = np.where(better, value, best_value)
@@ -112,7 +113,7 @@ def uncertain_ball(problem: ObserverProblem, freqs_hz: AnyArray) -> Ball:
 
 def spread(P: AnyArray, Q: AnyArray) -> AnyArray:
     """Largest ``||P Theta Q||_F`` over contractions, ``(sum_i s_i(P)^2 s_i(Q)^2)^(1/2)``, shape (f,)."""
-    s, t = np.linalg.svd(P, compute_uv=False), np.linalg.svd(Q, compute_uv=False)
+    s, t = svd(P, compute_uv=False), svd(Q, compute_uv=False)
     k = min(s.shape[-1], t.shape[-1])
     return np.sqrt(np.sum((s[..., :k] * t[..., :k]) ** 2, axis=-1))
 
@@ -125,14 +126,14 @@ def _with_gains(U: AnyArray, gains: AnyArray) -> AnyArray:
 
 def polar(matrix: AnyArray) -> AnyArray:
     """Return the unitary polar factors, shape (f, a, b)."""
-    U, _, Vh = np.linalg.svd(matrix, full_matrices=False)
+    U, _, Vh = svd(matrix, full_matrices=False)
     return U @ Vh
 
 
 def dual_bound(a: AnyArray, P: AnyArray, Q: AnyArray) -> AnyArray:
     """Upper bound of ``max ||a + P Theta Q||_F`` over contractions, shape (f,)."""
-    U, s, _ = np.linalg.svd(P, full_matrices=False)
-    _, q, Hh = np.linalg.svd(Q, full_matrices=False)
+    U, s, _ = svd(P, full_matrices=False)
+    _, q, Hh = svd(Q, full_matrices=False)
     d = (s[..., :, None] * q[..., None, :]) ** 2
     rotated = adjoint(U) @ a @ adjoint(Hh)
     c = d * np.abs(rotated) ** 2

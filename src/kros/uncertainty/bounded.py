@@ -201,53 +201,13 @@ def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
         known = {name: getattr(models, name) for name in names if getattr(options, name) is None}
         options = options.model_copy(update=known)
         models = models.systems(tuple(options.unit_ids or ()))
-    system = stack_systems(models)
+    system = models if isinstance(models, StateSpace) else stack_systems(models)
+    if len(system.batch_shape) != 1:
+        problem = f"Quantify: needs a batch of models with one unit axis, found the batch shape {system.batch_shape}"
+        raise DimensionError(f"{problem}; stack the units.")
     if not system.dt > 0:
         raise ConfigError("Quantify: continuous systems have no weights; sample them, control.sample_system does it.")
-    require_stable(system, options.ids(system.batch_shape[0]))
-    return system, options
-
-
-def stack_systems(models: Any) -> StateSpace:
-    """Return a batch from a batch, or from a sequence of systems with the same outputs, inputs and sampling period."""
-    if not isinstance(models, StateSpace):
-        if isinstance(models, str) or not isinstance(models, Iterable):
-            remedy = "give a list of systems, an array of responses, or the result of kros.identify"
-            raise DimensionError(
-                f"Quantify: needs models of at least two units, found {type(models).__name__}; {remedy}."
-            )
-        systems = [StateSpace.of(system) for system in models]
-        kinds = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
-        if len(kinds) != 1:
-            problem = f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}"
-            raise DimensionError(f"{problem}; identify them alike, and give at least two.")
-        largest, dt = max(s.n_states for s in systems), systems[0].dt
-        padded = [_padded(s, largest - s.n_states) for s in systems]
-        A, B, C, D = (np.stack(matrices) for matrices in zip(*padded, strict=True))
-        models = StateSpace(A, B, C, D, dt)
-    if len(models.batch_shape) != 1:
-        problem = f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}"
-        raise DimensionError(f"{problem}; stack the units.")
-    return models
-
-
-def _padded(system: StateSpace, more: int) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    """Return A, B, C, D with further states without input and output, at rest after a sample."""
-    B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
-    return np.pad(system.A, (0, more)), B, C, system.D
-
-
-def check_scale(side: str, values: ArrayLike | None, size: int) -> AnyArray:
-    """Return ranges as an array, ones by default, or say what is wrong with them."""
-    scale = np.ones(size) if values is None else np.asarray(values, float)
-    if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
-        raise DimensionError(f"Uncertainty: {side}_scale needs {size} positive numbers, found {scale[:9]}.")
-    return scale
-
-
-def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
-    """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
-    for k, name in enumerate(names):
+    for k, name in enumerate(options.ids(system.batch_shape[0])):
         one = system[k]
         if not all(np.isfinite(getattr(one, matrix)).all() for matrix in "ABCD"):
             raise DataError(
@@ -256,6 +216,37 @@ def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
         if not one.is_stable():
             problem = f"the model of unit {name} is unstable (spectral radius {one.spectral_radius():.6f})"
             raise DataError(f"Quantify: {problem}; identify with more regularisation or leave it out.")
+    return system, options
+
+
+def stack_systems(models: Any) -> StateSpace:
+    """Return a batch from a sequence of systems with the same outputs, inputs and sampling period."""
+    if isinstance(models, str) or not isinstance(models, Iterable):
+        remedy = "give a list of systems, an array of responses, or the result of kros.identify"
+        raise DimensionError(f"Quantify: needs models of at least two units, found {type(models).__name__}; {remedy}.")
+    systems = [StateSpace.of(system) for system in models]
+    kinds = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
+    if len(kinds) != 1:
+        problem = f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}"
+        raise DimensionError(f"{problem}; identify them alike, and give at least two.")
+    most = max(s.n_states for s in systems)
+    pads = [(0, most - s.n_states) for s in systems]  # further states without input and output, at rest after a sample
+    A, B, C, D = zip(
+        *(
+            (np.pad(s.A, p), np.pad(s.B, (p, (0, 0))), np.pad(s.C, ((0, 0), p)), s.D)
+            for s, p in zip(systems, pads, strict=True)
+        ),
+        strict=True,
+    )
+    return StateSpace(np.stack(A), np.stack(B), np.stack(C), np.stack(D), systems[0].dt)
+
+
+def check_scale(side: str, values: ArrayLike | None, size: int) -> AnyArray:
+    """Return ranges as an array, ones by default, or say what is wrong with them."""
+    scale = np.ones(size) if values is None else np.asarray(values, float)
+    if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
+        raise DimensionError(f"Uncertainty: {side}_scale needs {size} positive numbers, found {scale[:9]}.")
+    return scale
 
 
 def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[AnyArray, AnyArray]:

@@ -121,12 +121,16 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
     options = problem.options
     search = replace(options.search, iterations=options.path_iterations)
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
+    pooled, last = data.rows, [episodes[-1] for episodes in data.keys.values()]
+    held = [last[row] for row in pooled]
     path: list[Array] = []
     rows: list[tuple[float, float]] = []
     for strength in options.strengths:
         V = _fit(problem.with_prior(strength), V, search).V
         path.append(V)
-        rows.append(trade_off(data, problem, V))
+        models = problem.matrices(V[pooled])
+        rms, _ = free_run_errors(data, models, pooled.tolist(), held)
+        rows.append((float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)))
         log.debug("prior of strength %g: score %.4g, peak residual %.3g", strength, *rows[-1])
         earlier = rows[-1 - options.patience][0] if len(rows) > options.patience else np.inf
         if rows[-1][0] > (1 - options.tolerance / 2) * earlier or rows[-1][1] > options.largest_residual:
@@ -259,12 +263,3 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
         size = f"{reached[which, state]:.3g} times the range of {data.lifting.states[state]!r}, beyond {bound:g}"
         remedy = "use functions that stay bounded, drop the episode, or set identify.refine = false"
         raise IdentificationError(f"Refinement: the free run over {keys[which]} reaches {size}; {remedy}.")
-
-
-def trade_off(data: TrainingData, problem: RefinementProblem, V: Array) -> tuple[float, float]:
-    """Return the error on held-out training episodes and the peak residual of models (unit, n_lifted, p) or of one."""
-    rows, count = data.rows, len(data.keys)
-    models = problem.matrices(np.broadcast_to(V, (count, *V.shape[-2:]))[rows])
-    last = [episodes[-1] for episodes in data.keys.values()]
-    rms, _ = free_run_errors(data, models, rows.tolist(), [last[row] for row in rows])
-    return float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)

@@ -42,9 +42,13 @@ def fit_weight(
         weight = fit.again(missed)
         proof, ratio = fit.proven(weight)
     cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
-    weight, some = _lifted(weight, proof, float(ratio.max())), cover.left.min(axis=1) > 0
+    on_grid, left = float(ratio.max()), weight.left
+    lift = max(proof.bound, on_grid) * (1 + PROOF.rounding) or 1.0  # until the left weight touches from above
+    left = replace(left, C=left.C * lift, D=left.D * lift)
+    weight, some = replace(weight, left=left, method=proof.method), cover.left.min(axis=1) > 0
     excess = weight.magnitudes(freqs_hz).at(some).cost_db() - cover.at(some).cost_db()
-    return replace(weight, overbound_db_max=float(excess.max(initial=0.0))), cover
+    overbound = float(excess.max(initial=0.0))
+    return replace(weight, cover_max=on_grid / lift, overbound_db_max=overbound), cover
 
 
 def checking_grid(freqs_hz: AnyArray, sample_period_s: float) -> AnyArray:
@@ -138,13 +142,6 @@ class _Fit:
         optimal = np.where(self._inside(freqs_hz), np.interp(freqs_hz, self.freqs_hz[known], cost), np.inf)
         tau = bilinear_squared(freqs_hz, self.dt)
         return JointProblem.of(tau[some], optimal[some], E[leading[:, some], some]), cover.at(some)
-
-
-def _lifted(weight: Weight, proof: Certificate, on_grid: float) -> Weight:
-    """Scale the left weight until it touches the residuals from above."""
-    lift, left = max(proof.bound, on_grid) * (1 + PROOF.rounding) or 1.0, weight.left
-    left = replace(left, C=left.C * lift, D=left.D * lift)
-    return replace(weight, left=left, cover_max=on_grid / lift, method=proof.method)
 
 
 def _peaks(ratio: AnyArray) -> AnyArray:

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from kros.core.errors import DataError
-from kros.evaluate.intervals import draw_reserve, fewest_units, next_unit_bound
+from kros.evaluate.errors import draw_reserve, fewest_units, next_unit_bound
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ Examples
 """
 
 from ..core.removed import refusing
-from .errors import error_percent, fit_percent
-from .intervals import unit_interval
+from .errors import error_percent, fit_percent, unit_interval
 
 __all__ = ["error_percent", "fit_percent", "unit_interval"]
 

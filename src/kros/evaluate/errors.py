@@ -7,17 +7,34 @@ observer that was made to agree with the recording then trails as well, and its 
 show it; error and lag against the truth do.
 
 Validation of models and excitations as in system identification: fit, correlation of residuals, coherence.
+
+How sure a mean error over units is: bootstrap over units, not samples, since units are what differs.
+
+Source: B. Efron and R. J. Tibshirani, An Introduction to the Bootstrap, Chapman & Hall 1993, chapter 13.
+
+What the errors of units that took part in nothing say about the next one: split conformal prediction.
+
+Of ``n`` units that nothing was made from, and one more that is exchangeable with them, every order of their errors is
+equally likely. So the error of the next unit is at most the ``ceil(confidence (n + 1))``-th smallest of theirs with a
+probability of at least ``confidence``, whatever their distribution, the observer or the plant. Several errors are
+bounded together by the largest one relative to a scale that was fixed before.
+
+Source: V. Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, Springer 2005, section 4.2; H.
+Papadopoulos et al., Inductive Confidence Machines for Regression, ECML 2002.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import ceil
 from typing import Any, TypeVar
 
 import numpy as np
 
-from ..core.arrays import Array, Whole, frozen
+from ..core.arrays import Array, ArrayLike, Whole, frozen
+from ..core.errors import DataError
+from ..core.rounding import ITERATED
 from ..data.population import EpisodeKey, Population
 
 T = TypeVar("T")
@@ -193,3 +210,81 @@ def excitation(
     power = np.einsum("iif->if", mean).real
     power = np.where(power > 0, power, np.nan)
     return spectra[0][0], power, np.abs(mean) ** 2 / (power[:, None] * power)
+
+
+Row = Mapping[str, Any]
+_CELL = ("observer", "condition", "channel")
+
+
+def unit_interval(values: ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[Array, Array]:
+    """Return the 95 % percentile bootstrap interval of the mean over units.
+
+    Parameters
+    ----------
+    values : array_like, shape (unit, ...)
+        One number a unit, such as its mean error.
+    draws, seed : int
+
+    Returns
+    -------
+    lower, upper : ndarray, shape (...)
+
+    Raises
+    ------
+    DataError
+        With fewer than two units, where nothing can be resampled.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import unit_interval
+    >>> lower, upper = unit_interval(np.linspace(1.0, 2.0, 20))
+    >>> bool(lower < 1.5 < upper)
+    True
+    """
+    from scipy.stats import bootstrap
+
+    values = np.asarray(values, dtype=float)
+    if values.ndim < 1 or len(values) < 2:
+        raise DataError(f"Bootstrap over units: needs at least 2 units, found values of shape {values.shape}.")
+    rng = np.random.default_rng(seed)
+    result = bootstrap((values,), np.mean, n_resamples=draws, method="percentile", rng=rng)
+    return result.confidence_interval.low, result.confidence_interval.high
+
+
+def interval_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the 95 % ``interval`` of the mean error over at least three units, by observer, condition and channel."""
+    errors: dict[tuple[str, ...], dict[str, Any]] = {}
+    for row in (row for row in rows if row["role"] == "off_nominal"):
+        errors.setdefault(tuple(row[name] for name in _CELL), {})[row["unit"]] = row["error_percent"]
+    intervals = []
+    for cell, by_unit in errors.items():
+        values = [by_unit[unit] for unit in sorted(by_unit)]
+        if len(values) > 2 and all(value is not None and np.isfinite(value) for value in values):
+            lower, upper = unit_interval(values)
+            interval = [float(lower), float(upper)]
+            intervals.append({**dict(zip(_CELL, cell, strict=True)), "role": "off_nominal", "interval": interval})
+    return intervals
+
+
+def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]:
+    """Draw units that take part in nothing, by place alone; more of them include fewer."""
+    drawn = np.random.default_rng(seed).permutation(len(units))[:n]
+    return tuple(units[i] for i in sorted(drawn))
+
+
+def fewest_units(confidence: float) -> int:
+    """Return how many units bound the next one: ``1 / (1 - confidence) - 1``, rounded up."""
+    return ceil(confidence / (1 - confidence) - ITERATED)  # 0.9 / (1 - 0.9) is a little more than 9
+
+
+def next_unit_bound(errors: ArrayLike, scale: ArrayLike, confidence: float = 0.95) -> Array | None:
+    """Bound the errors of the next unit, (k,), all of them together; None with fewer units than `fewest_units`."""
+    errors, scale = np.asarray(errors, dtype=float), np.asarray(scale, dtype=float)
+    if not (np.isfinite(scale) & (scale > 0)).all():
+        raise DataError(f"Bound of the next unit: a scale is positive and finite, found {scale.tolist()}.")
+    if len(errors) < fewest_units(confidence):
+        return None
+    scores = np.max(np.where(np.isfinite(errors), errors, np.inf) / scale, axis=1)
+    rank = ceil(confidence * (len(errors) + 1) - ITERATED)
+    return np.sort(scores)[rank - 1] * scale

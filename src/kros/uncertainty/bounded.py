@@ -125,7 +125,12 @@ def _bound(
     """Return the set around the best nominal or that of the options, with the remainder where the form leaves one."""
     responses = units.frequency_response(freqs)
     choices = {form: choose_nominal(responses, form) for form in Form}
-    index, target = options.row(ids, choices[form].index), (dt, options.max_order, options.tolerance_db)
+    target, index = (dt, options.max_order, options.tolerance_db), options.nominal
+    if index is None or index in ids:
+        index = choices[form].index if index is None else ids.index(str(index))
+    if isinstance(index, str) or not 0 <= index < len(ids):
+        known = f"give one of the units {', '.join(ids[:10])}, or a row below {len(ids)}"
+        raise ConfigError(f"Quantify: nominal {index!r} is out of range; {known}.")
     residuals, G = Residuals(form, units[index], units, len(ids)), responses[index]
     weight, cover = fit_weight(residuals, freqs, *target)
     ratios, largest = zip(*((misfit(form, G, Gp), sigma_max(E)) for Gp, E in residuals.pieces(freqs)), strict=True)
@@ -182,16 +187,6 @@ class Options(WeightSettings):
             needs = f"uncertainty of a population needs at least two units, found {count} ({', '.join(ids)})"
             raise DataError(f"Quantify: {needs}; record more units.")
         return ids
-
-    def row(self, ids: tuple[str, ...], best: int) -> int:
-        """Return the row of the nominal among the units: by name or row, otherwise the best."""
-        if isinstance(self.nominal, str) and self.nominal in ids:
-            return ids.index(self.nominal)
-        index = best if self.nominal is None else self.nominal
-        if isinstance(index, str) or not 0 <= index < len(ids):
-            known = f"give one of the units {', '.join(ids[:10])}, or a row below {len(ids)}"
-            raise ConfigError(f"Quantify: nominal {index!r} is out of range; {known}.")
-        return index
 
 
 def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:

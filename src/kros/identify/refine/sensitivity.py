@@ -211,14 +211,20 @@ class _Run:
     def rows(self, window: Array) -> Iterator[Array]:
         """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from a window on."""
         n, p, batch = self.W.shape
-        past = _moving_past(self.lifting)
+        lifting, window_of = self.lifting, self.lifting.window
+        read = {name for formula in (*lifting.formulas, *lifting.input_formulas) for name in formula.used}
+        past = [  # earlier values of states that a formula reads: entry of the window, state and delay
+            (entry, lifting.states.index(quantity), delay)
+            for entry, (quantity, delay) in enumerate(window_of.quantities)
+            if delay and window_of.names[entry] in read and quantity in lifting.states
+        ]
         S = np.zeros(
             (2 + max((d for _, _, d in past), default=0), n, n * p, batch)
         )  # now, earlier, and space for the next
         if (loops := library()) is not None:
             yield from self._compiled(loops, window, S, past)
             return
-        lifting, nl, h = self.lifting, self.lifting.n_lifted, self.lifting.history
+        nl, h = lifting.n_lifted, lifting.history
         psi, recent = np.empty((p, batch)), list(S)
         psi[:n] = window[:n]
         for k in range(h, len(self.x) - 1):
@@ -277,14 +283,3 @@ class _Run:
             slopes = lifting.slopes(window.T, self.parameters, u=u.T)[..., moving]
             F += np.einsum("afb,bfj->ajb", W[:, nl + len(u) :], slopes)
         return F
-
-
-def _moving_past(lifting: Lifting) -> list[Past]:
-    """Earlier values of states that a formula reads: entry of the window, state and delay."""
-    read = {name for formula in (*lifting.formulas, *lifting.input_formulas) for name in formula.used}
-    window, states = lifting.window, lifting.states
-    return [
-        (entry, states.index(quantity), delay)
-        for entry, (quantity, delay) in enumerate(window.quantities)
-        if delay and window.names[entry] in read and quantity in states
-    ]

@@ -23,8 +23,8 @@ from ...core.errors import ConfigError, IdentificationError, KrosError
 from ...core.work import Progress
 from ...data.population import OUTLIERS, Population, split_episodes
 from ...design.task import is_robust
+from ...evaluate.errors import fewest_units, next_unit_bound
 from ...evaluate.held_out import HeldOut, Outcome
-from ...evaluate.intervals import fewest_units, next_unit_bound
 from ...identify.calibration import Values, unit_parameters
 from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer

@@ -54,7 +54,9 @@ class Frame:
         """Scale, map and normalise a regular plant."""
         n, n_w, n_u, n_z, n_y = given.sizes
         scaled = scale(given)
-        p = _even(scaled)
+        X, Y = riccati_pair(scaled, "H-infinity synthesis, balancing")  # in coordinates that balance these
+        x = balancing(_root(Y, _size(scaled.A, scaled.B1)), _root(X, _size(scaled.A, scaled.C1)))[:2]
+        p = scaled.transformed(x=x)
         if given.dt > 0:
             if n and cond(p.A + np.eye(n)) > SINGULAR:
                 pole = "the plant has a pole at z = -1, which no bilinear map takes to continuous time"
@@ -148,13 +150,6 @@ def scale(plant: GeneralizedPlant) -> GeneralizedPlant:
     sizes = balanced_size(np.block([[p.A, inputs], [outputs, np.zeros((1, 1))]]))
     size = sizes[:-1] / sizes[-1]
     return p.transformed(x=(np.diag(1 / size), np.diag(size)))
-
-
-def _even(p: GeneralizedPlant) -> GeneralizedPlant:
-    """Return the plant in coordinates that balance the Riccati solutions of its H2 problem."""
-    X, Y = riccati_pair(p, "H-infinity synthesis, balancing")
-    left, right, _ = balancing(_root(Y, _size(p.A, p.B1)), _root(X, _size(p.A, p.C1)))
-    return p.transformed(x=(left, right))
 
 
 def _root(M: AnyArray, size: float) -> AnyArray:

@@ -135,18 +135,20 @@ def _bound(
     weight, cover = fit_weight(residuals, freqs, *target)
     ratios, largest = zip(*((misfit(form, G, Gp), sigma_max(E)) for Gp, E in residuals.pieces(freqs)), strict=True)
     ratio, bound = np.concatenate(ratios), np.concatenate(largest).max(axis=0)
-    fields = {
+    remainder = fit_weight(replace(residuals, remainder=True), freqs, *target)[0] if _leaves_out(form, ratio) else None
+    return {
         "form": form,
         "unit_ids": ids,
         "nominal": index,
         "nominal_id": ids[index],
         "freqs_hz": freqs,
         "misfit": ratio,
+        "bounds": {f: choice.bound for f, choice in choices.items()} | {form: bound},
+        "nominals": {f: ids[choice.index] for f, choice in choices.items()} | {form: ids[index]},
+        "cover": cover,
+        "weight": weight,
+        "remainder": remainder,
     }
-    fields["bounds"] = {f: choice.bound for f, choice in choices.items()} | {form: bound}
-    fields["nominals"] = {f: ids[choice.index] for f, choice in choices.items()} | {form: ids[index]}
-    remainder = fit_weight(replace(residuals, remainder=True), freqs, *target)[0] if _leaves_out(form, ratio) else None
-    return fields | {"cover": cover, "weight": weight, "remainder": remainder}
 
 
 def _leaves_out(form: Form, ratio: AnyArray) -> bool:

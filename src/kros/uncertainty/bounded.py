@@ -227,15 +227,15 @@ def stack_systems(models: Any) -> StateSpace:
         problem = f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}"
         raise DimensionError(f"{problem}; identify them alike, and give at least two.")
     most = max(s.n_states for s in systems)
-    pads = [(0, most - s.n_states) for s in systems]  # further states without input and output, at rest after a sample
-    A, B, C, D = zip(
-        *(
-            (np.pad(s.A, p), np.pad(s.B, (p, (0, 0))), np.pad(s.C, ((0, 0), p)), s.D)
-            for s, p in zip(systems, pads, strict=True)
-        ),
-        strict=True,
-    )
-    return StateSpace(np.stack(A), np.stack(B), np.stack(C), np.stack(D), systems[0].dt)
+
+    def padded(system: StateSpace) -> tuple[AnyArray, ...]:
+        """Add states without input and output, at rest after a sample."""
+        more = (0, most - system.n_states)
+        B, C = np.pad(system.B, (more, (0, 0))), np.pad(system.C, ((0, 0), more))
+        return np.pad(system.A, more), B, C, system.D
+
+    A, B, C, D = map(np.stack, zip(*map(padded, systems), strict=True))
+    return StateSpace(A, B, C, D, systems[0].dt)
 
 
 def check_scale(side: str, values: ArrayLike | None, size: int) -> AnyArray:

@@ -184,7 +184,7 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
     tasks = [partial(bound_systems, *one, options) for one in every]
     sets = dict(zip(models.kinds, work.run("quantify", tasks), strict=True))
-    uncertain = sets[models.kinds[0]]
+    uncertain = sets[first.name]
     responses = first.scaled_responses(uncertain.freqs_hz, uncertain.unit_ids)
     peaks = sigma_max(residual(uncertain.form, responses[uncertain.nominal], responses)).max(axis=-1)
     peaks[uncertain.nominal] = -np.inf

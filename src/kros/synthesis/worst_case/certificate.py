@@ -3,7 +3,7 @@ r"""Certified worst-case H2 norm of an observer, however it was found: a correct
 .. math::
     \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta + \|\bar e\|^2
 
-``b_Delta`` bounds ``||T_s W_u + T X M||_F`` over the matrix ball (`ball`): ``T_s``, from the input to the error on the
+``b_Delta`` bounds ``||T_s W_u + T X M||_F`` over the matrix ball (`Ball`): ``T_s``, from the input to the error on the
 nominal model, is zero for observers that correct that model. ``b_r`` bounds the additive remainder, a ball around zero;
 it adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds; so
 does that of the mean error ``bar e``, which a constant in the estimate leaves. Delta is any frequency-wise contraction,

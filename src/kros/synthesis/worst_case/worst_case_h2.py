@@ -14,7 +14,7 @@ correction has full authority over the state, so the optimum keeps the predicted
 with ``L`` the gain of the steady-state predictor of ``(xi, x_d, x_r)``. The order of K is that of the shaping filters
 only.
 
-The lower bound is in `members`.
+The lower bound is in `lower_bound`.
 
 Lower bound of the worst case over the set: no observer does better on members of the set that are systems.
 

@@ -12,7 +12,7 @@ No single nominal decides; beside the excess stands its range over every unit as
 its criterion.
 
 Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold
-rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`tail`): an
+rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`score`): an
 extrapolation, and labelled as such. Units are taken out one at a time while they are beyond, up to a third of the
 units. Fewer than eight units decide nothing. All this compares estimates that are equally good: units that were
 recorded for too little are left open before (`population`). What a score would have shown stands beside it (`score`).

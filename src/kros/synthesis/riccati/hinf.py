@@ -6,7 +6,7 @@ r"""H-infinity synthesis: one search over levels, each with a controller or the 
                           +----------------------------- next level <---------------------------------+
 
 What is attained is always a norm that was computed from a closed loop. Out of reach is what signals of one frequency
-prove (`frequency_bound`), or a level whose necessary conditions fail by more than rounding. A level for which the equations
+prove (`frequency_bound`), or a level whose conditions fail by more than rounding. A level for which the equations
 have no solution proves nothing.
 
 Lower bounds of the H-infinity problem at single frequencies (Parrott's theorem).

@@ -22,7 +22,7 @@ from kros.evaluate.closed_loop import Controller, close_loop
 from kros.evaluate.closed_loop.linear_loop import LinearLoop
 from kros.evaluate.closed_loop.simulated_loop import diverging
 from kros.observer import Observer
-from kros.synthesis.problem.interconnect import interconnect
+from kros.synthesis.generalized_plant import interconnect
 from kros.uncertainty.quantify import UncertainModels
 
 VERDICT, SAMPLES, MEMBERS, LARGEST = 1000, 5000, 20, 100.0

@@ -29,7 +29,7 @@ from kros.design.validation import TrainingSet
 from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
 from kros.observer.simulate import run_innovations
-from kros.plants.harmonic_drive.parameters import DriveParameters
+from kros.plants.harmonic_drive.dynamics import DriveParameters
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 DESIGN_SEED, UNITS, EPISODES, SECONDS, WITHIN_S, RATE = 9041, 12, 6, 12.0, 10.0, 0.02

@@ -34,7 +34,7 @@ import numpy.typing as npt
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, write_parquet
 from kros.data.prepare import assemble
 from kros.plants.batch import SimulatedEpisodes
-from kros.plants.harmonic_drive.reference import episode_reference
+from kros.plants.harmonic_drive.population import episode_reference
 
 Array = npt.NDArray[np.float64]
 

@@ -99,8 +99,7 @@ def random_problem(rng: np.random.Generator) -> ObserverProblem:
     if rng.random() < 0.25:
         parts["process_noise"] = scale * 10.0 ** rng.uniform(-4, -1, n)
     problem = ObserverProblem(**parts)
-    loop = problem.N
-    size = 0.0 if loop is None else hinf_norm(loop, 1e-3)
+    size = hinf_norm(problem.N, 1e-3)
     return problem if size < 0.9 else replace(problem, W_L=_times(problem.W_L, rng.uniform(0.2, 0.85) / size))
 
 

@@ -19,8 +19,7 @@ from kros.core.norms import to_continuous
 from kros.interop.control import from_control, to_control
 from kros.plants import PendulumPopulation
 from kros.synthesis import h2, hinf
-from kros.synthesis.generalized_plant import split
-from kros.synthesis.problem.interconnect import interconnect
+from kros.synthesis.generalized_plant import interconnect, split
 from kros.uncertainty import quantify
 
 DT, REFERENCE_RAD = 0.01, 0.25

@@ -9,7 +9,7 @@ import pytest
 from kros.identify import ModelSet
 from kros.observer import Observer, run_observer
 from kros.observer.sensor_gains import sensor_gains
-from kros.plants.harmonic_drive.parameters import VELOCITY_POLE
+from kros.plants.harmonic_drive.dynamics import VELOCITY_POLE
 
 STAGES = ["read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report"]
 FORMS = {

@@ -13,8 +13,7 @@ from kros.core.work import Work
 from kros.data import split_episodes, write_parquet
 from kros.data.readers.parquet import read_parquet
 from kros.identify import ModelSet
-from kros.identify.calibration import calibration_keys, segments_of
-from kros.identify.unit_phases import unit_parameters
+from kros.identify.calibration import calibration_keys, segments_of, unit_parameters
 from kros.observer import Observer, run_observer
 from kros.study import load_config
 from kros.study import run as run_study

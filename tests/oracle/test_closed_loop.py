@@ -16,7 +16,7 @@ from kros.evaluate.closed_loop.linear_loop import LinearLoop, linear_estimator
 from kros.evaluate.closed_loop.small_gain import Blocks, attained, least_level
 from kros.observer import Observer, Runtime
 from kros.synthesis import ObserverProblem
-from kros.synthesis.problem.interconnect import interconnect
+from kros.synthesis.generalized_plant import interconnect
 from kros.uncertainty import Form, rebuild
 
 DT = 0.1

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from kros.core.errors import DataError
-from kros.evaluate.next_unit import draw_reserve, fewest_units, next_unit_bound
+from kros.evaluate.over_units import draw_reserve, fewest_units, next_unit_bound
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from kros.evaluate.truth import delay_samples, true_errors
+from kros.evaluate.errors import delay_samples, true_errors
 
 N = 3000
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kros.identify.bootstrap import ModelSamples, bootstrap_edmd, episode_weights
+from kros.identify.edmd import ModelSamples, bootstrap_edmd, episode_weights
 
 TRUE = np.array([[0.8, 0.3, 0.0], [-0.3, 0.7, 0.5]])
 DT = 0.01

@@ -11,8 +11,7 @@ from kros.data import Channel, EpisodeKey, Role, Unit
 from kros.identify import Factor, KoopmanMatrices, combine, free_run
 from kros.identify.factors import lifted_factor, reduce_episode
 from kros.identify.refine import RefineOptions, refine_population
-from kros.identify.refine.segments import Segments
-from kros.identify.refine.sensitivity import normal_equations
+from kros.identify.refine.sensitivity import Segments, normal_equations
 from kros.lifting import Lifting
 
 DELAYED = Lifting(

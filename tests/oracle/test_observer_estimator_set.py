@@ -50,7 +50,7 @@ def problem(form, size=0.3, seed=0, dynamic=False, **changes):
     parts |= {"input_scale": np.array([1.5]), "output_scale": np.array([0.8, 1.2, 0.5])}
     parts |= {"process_noise": np.array([0.0, 0.01, 0.02])} | changes
     case = ObserverProblem(NOMINAL, np.eye(3)[:1], form=form, **parts)
-    largest = 1.0 if case.N is None else hinf_norm(case.N)
+    largest = hinf_norm(case.N) or 1.0
     W_L = case.W_L
     return replace(case, W_L=replace(W_L, C=W_L.C * size / largest, D=W_L.D * size / largest))
 
@@ -81,7 +81,7 @@ def connected(case, estimate, true):
 def member(case, E):
     """Return the plant that static E makes of NOMINAL, in physical units."""
     x, u, eye = np.diag(case.output_scale), np.diag(case.input_scale), np.eye
-    location = case.location
+    location = case.form
     E = (x if not location.at_input else u) @ E @ np.linalg.inv(u if location.sees_input else x)
     if case.form is Form.ADDITIVE:
         return StateSpace(A, B, eye(3), E, DT)

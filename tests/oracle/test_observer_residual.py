@@ -8,8 +8,7 @@ from kros.core import StateSpace
 from kros.lifting import Lifting
 from kros.observer.residual import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 from kros.synthesis import Injection, Status, kalman
-from kros.synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
-from kros.synthesis.residual_shaped.shaping_filter import Basis, shaping_filter
+from kros.synthesis.residual_shaped.residual_h2 import Basis, ResidualProblem, residual_h2, shaping_filter
 
 DT = 1e-2
 A = np.array([[1.0, 0.01], [-0.05, 0.95]])

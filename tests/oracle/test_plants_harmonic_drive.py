@@ -9,9 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.dynamics import Physics, simulate
-from kros.plants.harmonic_drive.parameters import GAINS, VELOCITY_POLE, DriveParameters, Loop
-from kros.plants.harmonic_drive.reference import MAX_SPEED
+from kros.plants.harmonic_drive.dynamics import GAINS, VELOCITY_POLE, DriveParameters, Loop, Physics, simulate
+from kros.plants.harmonic_drive.population import MAX_SPEED
 
 PERIOD = 1e-3
 TURN = 20  # samples of a motor revolution at full speed
@@ -160,12 +159,12 @@ def test_at_constant_speed_current_is_friction_and_the_position_error_vanishes(l
     n = 6000
     velocity = np.clip(np.arange(n) / 500.0, 0, 1) * speed
     position = np.cumsum(velocity) * PERIOD
-    signals = simulate(p, np.zeros(5), np.zeros(5, int), (position[None], velocity[None]), GAINS[loop])
+    states, _, _ = simulate(p, np.zeros(5), np.zeros(5, int), (position[None], velocity[None]), GAINS[loop])
     tail = slice(n - 2000, n)  # 80 motor revolutions
     friction = (p.dry_friction(np.full(5, speed)) + p.viscous_friction * speed) / p.torque_constant
-    np.testing.assert_allclose(signals.states[:, 2, tail].mean(axis=1), friction, atol=2e-3)
-    np.testing.assert_allclose(signals.states[:, 0, tail].mean(axis=1), position[tail].mean(), atol=5e-6)
-    np.testing.assert_allclose(signals.states[:, 1, tail].mean(axis=1), speed, atol=1e-4)
+    np.testing.assert_allclose(states[:, 2, tail].mean(axis=1), friction, atol=2e-3)
+    np.testing.assert_allclose(states[:, 0, tail].mean(axis=1), position[tail].mean(), atol=5e-6)
+    np.testing.assert_allclose(states[:, 1, tail].mean(axis=1), speed, atol=1e-4)
 
 
 def test_at_rest_the_load_torque_is_gravity_and_the_current_holds_it(drives):

@@ -10,9 +10,9 @@ from scipy.linalg import solve_discrete_are
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain
 from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, worst_case_h2
 from kros.synthesis.result import enclosed
-from kros.synthesis.riccati.kalman import predictor_bound
+from kros.synthesis.riccati.h2 import predictor_bound
 from kros.synthesis.worst_case.certificate import certify
-from kros.synthesis.worst_case.members import mean, member, shifts
+from kros.synthesis.worst_case.worst_case_h2 import mean, member, shifts
 
 DT = 1.0
 FULL = StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT)
@@ -174,8 +174,7 @@ def test_members_are_plants_of_the_set(changes):
     for delta in shifts(case.W_L.n_inputs, case.W_R.n_outputs):
         assert np.linalg.norm(delta, 2) <= 1
         loop = np.eye(delta.shape[1]) + 0j * freqs[:, None, None]
-        if case.N is not None:
-            loop = loop - case.N.frequency_response(freqs) @ delta
+        loop = loop - case.N.frequency_response(freqs) @ delta
         seen = np.linalg.solve(loop, case.M.frequency_response(freqs))
         expected = case.W_L.frequency_response(freqs) @ delta @ seen
         assert member(case, delta).frequency_response(freqs) == pytest.approx(expected, rel=1e-9)

@@ -11,8 +11,7 @@ from scipy.linalg import expm
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, h2, mixed
 from kros.synthesis.mixed_norms.barrier import minimise
-from kros.synthesis.mixed_norms.inequalities import MixedInequalities, balance
-from kros.synthesis.mixed_norms.mixed import by_inequalities, scaled, truncate, verify
+from kros.synthesis.mixed_norms.mixed import MixedInequalities, by_inequalities, scaled, truncate, verify
 from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.worst_case.certificate import certify
 
@@ -86,12 +85,11 @@ def test_inequalities_bound_the_norms_and_agree_with_another_solver():
     plant = two_channel(np.random.default_rng(10))
     free, peak = free_optimum(plant)
     gamma = 0.9 * peak
-    balanced = balance(scaled(at_level(plant, gamma), 16.0))
-    inequalities = MixedInequalities(balanced)
+    inequalities = MixedInequalities.of(scaled(at_level(plant, gamma), 16.0))
     own = minimise(inequalities.objective(), inequalities.blocks(), inequalities.start(), rtol=1e-6)
     assert own.value == pytest.approx(by_clarabel(inequalities), rel=1e-4)
     checked = verify(at_level(plant, gamma), inequalities.controller(own.x))
-    assert free.h2_norm <= checked.h2_norm <= balanced.size * np.sqrt(own.value)
+    assert free.h2_norm <= checked.h2_norm <= inequalities.norm * np.sqrt(own.value)
     assert checked.hinf_norm < 1
 
 

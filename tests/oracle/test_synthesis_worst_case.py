@@ -10,8 +10,7 @@ from scipy.optimize import minimize
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm
 from kros.synthesis import Injection, ObserverProblem, Status, worst_case_h2
-from kros.synthesis.worst_case.ball import Ball, dual_bound, spread
-from kros.synthesis.worst_case.certificate import certify, circle_mean, density
+from kros.synthesis.worst_case.certificate import Ball, certify, circle_mean, density, dual_bound, spread
 
 DT = 1e-3
 
@@ -73,7 +72,7 @@ def test_the_set_is_a_matrix_ball_of_any_shape(shape):
     for _ in range(10):
         N = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
         N *= rng.uniform(0.3, 0.9) / np.linalg.norm(N, 2)
-        ball = Ball.of(N[None], np.eye(a)[None], b)
+        ball = Ball.of(N[None], np.eye(a)[None])
         free = rng.standard_normal((b, a)) + 1j * rng.standard_normal((b, a))
         delta = free / np.linalg.norm(free, 2)
         X = delta @ np.linalg.inv(np.eye(a) - N @ delta)
@@ -90,7 +89,7 @@ def test_bound_against_optimised_perturbations():
     ratios = []
     for _ in range(10):
         N, M, T = random_matrices(rng)
-        bound = Ball.of(N[None], M[None], 2).bound(T[None])[0]
+        bound = Ball.of(N[None], M[None]).bound(T[None])[0]
 
         def size(x, N=N, M=M, T=T):
             delta = contraction(x, 2)
@@ -123,7 +122,7 @@ def test_the_average_is_that_of_samples_and_the_bound_holds_for_them():
     rng = np.random.default_rng(3)
     N, M = np.diag([0.5, 0.2j])[None], np.diag([1.0, 2.0])[None] + 0j
     T = rng.standard_normal((1, 3, 2)) + 0j
-    ball = Ball.of(N, M, 2)
+    ball = Ball.of(N, M)
     thetas = [contraction(rng.standard_normal(8), 2) for _ in range(20000)]
     elements = [ball.center[0] + ball.left[0] @ t @ ball.right[0] for t in thetas]
     sampled = np.mean([x @ x.conj().T for x in elements], axis=0)

@@ -8,10 +8,10 @@ from tests.support.residuals import of_systems
 
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
-from kros.uncertainty import Form, fit_magnitude, residual
+from kros.uncertainty import fit_magnitude, residual
 from kros.uncertainty.weights.cover import Cover
 from kros.uncertainty.weights.fit import fit_weight
-from kros.uncertainty.weights.proof import ProofMethod, ResidualSystems, certify
+from kros.uncertainty.weights.proof import ProofMethod, certify
 
 DT = 1e-3
 GRID = np.geomspace(0.1, 500.0, 60)
@@ -43,7 +43,7 @@ def test_realisations_have_the_responses_of_the_residuals(form: str, shape: tupl
     E = residual(form, nominal.frequency_response(GRID), units.frequency_response(GRID))
     left, right = (gain(np.diag(np.arange(1.0, n + 1)), DT) for n in E.shape[2:])
     expected = Cover(np.tile(np.diag(left.D), (60, 1)), np.tile(np.diag(right.D), (60, 1))).ratio(E)
-    for unit, pencil in enumerate(ResidualSystems(Form(form), nominal, units).ratios(left, right)):
+    for unit, pencil in enumerate(of_systems(form, nominal, units).ratios(left, right)):
         s = 1j * np.tan(np.pi * GRID[:-1] * DT)
         found = [np.linalg.norm(pencil.C @ np.linalg.solve(x * pencil.F - pencil.A, pencil.B) + pencil.D, 2) for x in s]
         np.testing.assert_allclose(found, expected[unit, :-1], rtol=1e-7)
@@ -63,7 +63,7 @@ def test_realisations_of_remainders_are_what_the_form_leaves(form: str, states: 
         G, every = np.swapaxes(G, -1, -2), np.swapaxes(every, -1, -2)
     factor = np.linalg.inv(np.linalg.pinv(every) @ G) if form.startswith("inverse") else np.linalg.pinv(G) @ every
     left_over = every - G @ factor
-    systems = ResidualSystems(Form(form), nominal, units, remainder=True)
+    systems = of_systems(form, nominal, units, remainder=True)
     pencils = systems.ratios(gain(np.eye(nominal.n_outputs), DT), gain(np.eye(nominal.n_inputs), DT))
     assert len(pencils) == 2
     for pencil, expected in zip(pencils, left_over, strict=True):
@@ -85,7 +85,7 @@ def test_a_peak_between_grid_points_is_found_and_is_the_norm() -> None:
     def ratio(freqs: np.ndarray) -> np.ndarray:
         return np.abs(unit.frequency_response(freqs)[:, :, 0, 0])
 
-    proof = certify(ratio, GRID, ratio(GRID), ResidualSystems(Form.ADDITIVE, nominal, unit).ratios(one, one), DT)
+    proof = certify(ratio, GRID, ratio(GRID), of_systems("additive", nominal, unit).ratios(one, one), DT)
     assert proof.method is ProofMethod.LEVEL_SETS
     assert proof.peak == pytest.approx(hinf_norm(unit[0]), rel=2e-5)
     assert proof.freq_hz == pytest.approx(37.77, rel=1e-4)

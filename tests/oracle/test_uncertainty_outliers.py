@@ -7,8 +7,7 @@ import pytest
 from scipy import stats
 
 from kros.uncertainty import Form, score_outliers
-from kros.uncertainty.outliers.score import FEWEST_UNITS, Status
-from kros.uncertainty.outliers.tail import factor, margins, prediction_bound, scale, scales_without_one, separate
+from kros.uncertainty.outliers.score import FEWEST_UNITS, Status, factor, margins, prediction_bound, scale, separate
 
 FREQS = np.geomspace(0.1, 100.0, 60)
 
@@ -31,11 +30,12 @@ def test_lighter_tails_exceed_the_bound_less_often(draw) -> None:
     assert (draws[:, -1] > prediction_bound(draws[:, :-1], 0.01)).mean() < 0.01
 
 
-def test_scales_without_one_are_those_of_the_others() -> None:
+def test_the_bound_of_a_unit_is_that_of_the_others() -> None:
     for n in (3, 4, 9, 12):
         levels = np.random.default_rng(n).integers(0, 6, size=(n, 5)).astype(float)  # ties among them
-        expected = [scale(np.delete(levels, k, axis=0)) for k in range(n)]
-        np.testing.assert_allclose(scales_without_one(levels), expected, atol=1e-12)
+        expected = [factor(n - 1, 0.01) * scale(np.delete(levels, k, axis=0)).mean() for k in range(n)]
+        value, beyond = margins(levels, np.ones(n, bool), 0.01)
+        np.testing.assert_allclose(value - beyond, np.maximum(expected, 1e-8), atol=1e-12)
     assert scale(np.array([1.0, 9.0, 4.0, 2.0])) == pytest.approx((2 * (9 - 4) + 3 * (4 - 2) + 4 * (2 - 1)) / 3)
     assert factor(11, 0.003) == pytest.approx(10 * ((0.003 * 12) ** (-1 / 10) - 1))
     assert factor(1000, 0.003) == 0.0

@@ -4,7 +4,7 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.data import Channel, Role
-from kros.plants.harmonic_drive.parameters import Loop
+from kros.plants.harmonic_drive.dynamics import Loop
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from kros.core import DataError
 from kros.identify import KoopmanMatrices, edmd
-from kros.identify.bootstrap import ModelSamples, bootstrap_edmd, episode_weights
+from kros.identify.edmd import ModelSamples, bootstrap_edmd, episode_weights
 
 
 def factors(units: int, episodes: int, seed: int = 0) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from kros.core.errors import ConfigError, DataError
 from kros.data import EpisodeKey
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.parameters import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, DriveParameters
+from kros.plants.harmonic_drive.dynamics import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, DriveParameters
 
 SMALL = HarmonicDrivePopulation(n_units=3, n_episodes=2, seconds=3.0, seed=4, outlier=True)
 LOADED = EpisodeKey("001002", "load", "1")

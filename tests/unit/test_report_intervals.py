@@ -3,7 +3,7 @@
 import numpy as np
 
 from kros.evaluate import unit_interval
-from kros.evaluate.intervals import interval_rows
+from kros.evaluate.over_units import interval_rows
 from kros.report.error_tables import error_tables
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.support.residuals import of_systems
 
 from kros.core import KrosError, StateSpace
 from kros.core.errors import ConfigError
 from kros.core.frequency import log_grid
-from kros.uncertainty import Form, quantify
+from kros.uncertainty import quantify
 from kros.uncertainty.weights.fit import checking_grid, joined
 from kros.uncertainty.weights.magnitude import RationalMagnitude
-from kros.uncertainty.weights.proof import ResidualSystems
 
 
 def test_the_checking_grid_reaches_from_zero_to_nyquist_and_is_dense_everywhere() -> None:
@@ -40,7 +40,7 @@ def test_zeros_of_what_is_inverted_are_peaks(form: str) -> None:
     unit = StateSpace(inverse.A - inverse.B @ inverse.C, inverse.B, -inverse.C, [[1.0]], 1.0)
     assert unit.is_stable()
     units = StateSpace(*(np.stack([getattr(s, x) for s in (unit, heavy)]) for x in "ABCD"), 1.0)
-    found = ResidualSystems(Form(form), heavy, units).modes_hz(np.linspace(0, 0.5, 50))
+    found = of_systems(form, heavy, units).modes_hz(np.linspace(0, 0.5, 50), 1.0)
     assert np.abs(found - 1.2 / (2 * np.pi)).min() < 1e-5
 
 

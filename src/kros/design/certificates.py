@@ -17,7 +17,7 @@ from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..evaluate.errors import error_rms
 from ..identify import ModelSet
-from ..loops.filtering import recursion
+from ..loops.library import recursion
 from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, relift_certificate, run_observer
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound, linear_estimate

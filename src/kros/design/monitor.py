@@ -23,7 +23,7 @@ from ..observer import Observer
 from ..observer.estimator.regression import spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
 from ..observer.simulate import run_innovations
-from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
+from ..uncertainty.outliers.score import LEAST_SCORES, prediction_bound
 from .validation import TrainingSet
 
 log = logging.getLogger(__name__)

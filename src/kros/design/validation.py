@@ -14,8 +14,7 @@ from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.prepare import scale_population
 from ..evaluate.errors import error_rms, largest
-from ..evaluate.held_out import observers_run
-from ..evaluate.sensor import as_shown
+from ..evaluate.held_out import as_shown, observers_run
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..observer import Observer, Seen

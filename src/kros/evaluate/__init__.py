@@ -10,9 +10,8 @@ Examples
 """
 
 from ..core.removed import refusing
-from .errors import error_percent
-from .intervals import unit_interval
-from .validation import fit_percent
+from .errors import error_percent, fit_percent
+from .over_units import unit_interval
 
 __all__ = ["error_percent", "fit_percent", "unit_interval"]
 

@@ -1,4 +1,9 @@
-"""Errors and spectra of estimates (section IV-E)."""
+"""Errors and spectra of estimates (section IV-E), and errors against what states really were.
+
+A recorded state may itself be an estimate: a drive's velocity is a filtered difference of positions, which trails. An
+observer that was made to agree with the recording then trails as well, and its error against the recording does not
+show it; error and lag against the truth do.
+"""
 
 from __future__ import annotations
 
@@ -57,8 +62,7 @@ def error_rms(estimate: Array, truth: Array, lengths: Whole) -> Array:
     """Return the root mean square error of every episode, shape (batch, n); arguments as in `summarise`."""
     with np.errstate(over="ignore", invalid="ignore"):
         error = estimate - truth
-        if np.any(lengths != len(truth)):
-            error[np.arange(len(truth))[:, None] >= lengths] = 0.0
+        error[np.arange(len(truth))[:, None] >= lengths] = 0.0
         return np.sqrt(np.einsum("kbn,kbn->bn", error, error) / lengths[:, None])
 
 
@@ -78,8 +82,6 @@ def error_percent(estimate: Array, truth: Array, lengths: Whole) -> Array:
 
 def largest(truth: Array, lengths: Whole) -> Array:
     """Return the largest absolute values of episodes, shape (batch, n)."""
-    if np.all(lengths == len(truth)):
-        return np.maximum(truth.max(axis=0), -truth.min(axis=0))
     return np.max(np.abs(truth), axis=0, where=np.arange(len(truth))[:, None, None] < lengths[:, None], initial=0.0)
 
 
@@ -94,3 +96,67 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
     values = np.asarray(error, dtype=float)
     freqs_hz, density = welch(values, 1 / dt, nperseg=min(segment, values.shape[axis]), nfft=segment, axis=axis)
     return np.asarray(freqs_hz), np.asarray(density)
+
+
+@frozen
+class TrueErrors:
+    """Errors of signals against truths over a batch of episodes."""
+
+    states: tuple[int, ...]  # column of the state that each truth is the truth of
+    rms: Array  # (batch, n_truths)
+    error_percent: Array  # (batch, n_truths): as that of `ErrorSummary`
+    lag_s: Array  # (batch, n_truths), s: how late the signal is, see `delay_samples`; NaN where that is unknown
+
+
+def true_errors(signals: Array, truths: Array, states: tuple[int, ...], lengths: Whole, dt: float) -> TrueErrors:
+    """Return the errors of signals (n_samples, batch, n) against the truths of some states, and how late these are."""
+    signals, lag = signals[..., list(states)], np.empty(truths.shape[1:])
+    for length in np.unique(lengths):
+        rows = lengths == length
+        lag[rows] = delay_samples(signals[:length, rows], truths[:length, rows])
+    return TrueErrors(states, error_rms(signals, truths, lengths), error_percent(signals, truths, lengths), lag * dt)
+
+
+def delay_samples(signals: Array, truths: Array) -> Array:
+    """Return the delay of truths, at most 200 samples, that fits signals best; a parabola refines the least cost."""
+    from scipy.signal import fftconvolve
+
+    n = len(signals)
+    most = min(200, n // 4)  # samples
+    if most < 1:
+        return np.full(signals.shape[1:], np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        y, x = (values - truths.mean(axis=0) for values in (signals[most : n - most], truths))
+        common = fftconvolve(x, y[::-1], mode="valid", axes=0)
+        energy = np.cumsum(np.concatenate([np.zeros((1, *x.shape[1:])), x**2]), axis=0)
+        cost = energy[n - 2 * most :] - energy[: 2 * most + 1] - 2 * common
+        best = cost.argmin(axis=0)
+        middle = np.clip(best, 1, 2 * most - 1)
+        left, least, right = (np.take_along_axis(cost, (middle + side)[None], axis=0)[0] for side in (-1, 0, 1))
+        bend = left - 2 * least + right
+        delay = most - middle - 0.5 * (left - right) / bend
+    known = np.isfinite(signals).all(axis=0) & (np.ptp(x, axis=0) > 0) & (best == middle) & (bend > 0)
+    return np.where(known, delay, np.nan)
+
+
+def fit_percent(estimate: Array, recorded: Array) -> Array:
+    """Return ``100 (1 - |x - x_hat| / |x - mean(x)|)`` of every column, shape (n,), NaN for a constant one.
+
+    This is the fit of MATLAB's ``compare``: 100 % is exact, the mean of the recording has 0 %.
+
+    Parameters
+    ----------
+    estimate, recorded : ndarray, shape (n_samples, n)
+        Euclidean norms are over the samples of one episode.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.evaluate import fit_percent
+    >>> recorded = np.array([[0.0], [2.0], [4.0]])  # less their mean: the norm is the root of 8
+    >>> fit_percent(recorded + np.array([[1.0], [0.0], [1.0]]), recorded).round(9).tolist()
+    [50.0]
+    """
+    spread = np.linalg.norm(recorded - recorded.mean(axis=0), axis=0)
+    ratio = np.linalg.norm(recorded - estimate, axis=0) / np.where(spread > 0, spread, np.nan)
+    return 100 * (1 - ratio)

@@ -1,4 +1,4 @@
-"""Validation of models and excitations as in system identification: fit, correlation of residuals, coherence."""
+"""Validation as in system identification: correlation of residuals, spectra and coherence of excitations."""
 
 from __future__ import annotations
 
@@ -8,29 +8,6 @@ import numpy as np
 
 from ..core.arrays import Array
 from ..data.population import EpisodeKey, Population
-
-
-def fit_percent(estimate: Array, recorded: Array) -> Array:
-    """Return ``100 (1 - |x - x_hat| / |x - mean(x)|)`` of every column, shape (n,), NaN for a constant one.
-
-    This is the fit of MATLAB's ``compare``: 100 % is exact, the mean of the recording has 0 %.
-
-    Parameters
-    ----------
-    estimate, recorded : ndarray, shape (n_samples, n)
-        Euclidean norms are over the samples of one episode.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.evaluate import fit_percent
-    >>> recorded = np.array([[0.0], [2.0], [4.0]])  # less their mean: the norm is the root of 8
-    >>> fit_percent(recorded + np.array([[1.0], [0.0], [1.0]]), recorded).round(9).tolist()
-    [50.0]
-    """
-    spread = np.linalg.norm(recorded - recorded.mean(axis=0), axis=0)
-    ratio = np.linalg.norm(recorded - estimate, axis=0) / np.where(spread > 0, spread, np.nan)
-    return 100 * (1 - ratio)
 
 
 def correlation(later: Array, earlier: Array, lags: int) -> Array:

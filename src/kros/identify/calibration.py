@@ -14,6 +14,8 @@ Symbols
 e     : tracking error, reference - measured; its periodic part at constant reference is that of -measured
 theta : angle, rad;  r : ratio of the disturbance to the angle
 psi_i : phase of the error in segment i, ``atan2(<e, cos r theta>, <e, sin r theta>)``, the closed form of (40)
+
+Phases of units that took no part in a calibration, or of which there are other recordings.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from ..core.artifacts import Storable, digest_of
 from ..core.errors import IdentificationError
 from ..core.rounding import TINY
 from ..core.work import Work
-from ..data.population import EpisodeKey, Population
+from ..data.population import EpisodeKey, Population, split_episodes
 from .survey import RecordingFacts
 
 log = logging.getLogger(__name__)
@@ -154,7 +156,7 @@ def _error_phase(turn: Array, error: Array) -> float:
 
 def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitPhase:
     """Combine a unit's segments, each direction and speed by itself; needs a speed in both directions."""
-    phases, lags, weights, concentrations = [], [], [], []
+    rows = []
     remaining = sorted(segments, key=lambda s: -abs(s.speed))
     while remaining:
         speed = abs(remaining[0].speed)
@@ -163,20 +165,19 @@ def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitP
         forward, reverse = ([s for s in group if (s.speed > 0) is ahead] for ahead in (True, False))
         if forward and reverse:
             (psi_f, r_f), (psi_r, r_r) = _circular_mean(forward), _circular_mean(reverse)
-            phases.append((psi_f + psi_r) / 2)
-            lags.append((psi_f - psi_r) / 2)
-            concentrations.append(min(r_f, r_r))
-            weights.append(min(len(forward), len(reverse)))
-    if not phases:
+            shares = min(r_f, r_r), min(len(forward), len(reverse))
+            rows.append(((psi_f + psi_r) / 2, (psi_f - psi_r) / 2, *shares))
+    if not rows:
         ahead = sum(s.speed > 0 for s in segments)
         directions = {"forward": ahead, "reverse": len(segments) - ahead}
         raise IdentificationError(
             f"Phase calibration of unit {unit}: needs constant-velocity segments of equal speed in both directions, "
             f"found {directions}; record such motion, or lift with sine and cosine and no phase parameter."
         )
+    phases, lags, concentrations, weights = np.array(rows).T
     best = int(np.argmax(weights))
     # Phases of other speeds are put on the best speed's branch before averaging; their lags differ and are not mixed.
-    aligned = [p + np.pi * np.round((phases[best] - p) / np.pi) for p in phases]
+    aligned = phases + np.pi * np.round((phases[best] - phases) / np.pi)
     concentration = float(np.average(concentrations, weights=weights))
     if concentration < spec.least_concentration:
         log.warning("phase calibration of unit %s: its segments agree poorly, concentration %.2f", unit, concentration)
@@ -244,3 +245,62 @@ def calibration_keys(facts: RecordingFacts, unit: str) -> tuple[EpisodeKey, ...]
     """Return the episodes that a unit is calibrated on: those of `identify_on`, or of the first condition it has."""
     every = facts.keys("train", unit)
     return facts.keys("train", unit, facts.identify_on) or tuple(k for k in every if k.condition == every[0].condition)
+
+
+log = logging.getLogger(__name__)
+Values = dict[str, dict[str, float]]  # lifting parameters by unit
+Texts = dict[str, str]  # by unit
+
+
+def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
+    """Return the episodes that a unit is identified on: its training part, or its only episode."""
+    groups = {(u, c): keys for u, c, keys in population.groups()}
+    several = tuple(k for keys in groups.values() if len(keys) > 1 for k in keys)
+    splits = split_episodes(replace(population, episodes=several))
+    return groups | {group: split.train for group, split in splits.items()}
+
+
+def unit_values(
+    population: Population,
+    calibration: PhaseCalibration | None,
+    prefer: str,
+    given: Values | None = None,
+    facts: RecordingFacts | None = None,
+) -> tuple[Values, Texts, Texts]:
+    """Return the lifting parameters of units, where each came from, and why one is unknown.
+
+    They are given, calibrated in a condition, on the episodes that facts of these recordings name, or those of the run.
+    """
+    known, sources, reasons = {u: dict((given or {}).get(u, {})) for u in population.unit_ids}, Texts(), Texts()
+    if calibration is None:
+        return known, sources, reasons
+    training, spec = training_keys(population), calibration.spec
+    derived = "" if spec.measured in population.states else f" on the derivative of {spec.angle}"
+    for unit, values in known.items():
+        if spec.parameter in values:
+            sources[unit] = "given"
+            continue
+        by_condition = {condition: keys for (u, condition), keys in training.items() if u == unit}
+        keys = by_condition.get(prefer) or next(iter(by_condition.values()))
+        keys = keys if facts is None else calibration_keys(facts, unit)
+        try:
+            phase = calibration.calibrate(segments_of((population, keys, spec)), unit)
+            sources[unit] = f"calibrated{derived}"
+        except IdentificationError as error:
+            if unit not in calibration.units:
+                sources[unit], reasons[unit] = "unknown", str(error)
+                continue
+            phase, sources[unit] = calibration.units[unit], "of the run"
+            log.info("unit %s: its recordings do not determine the phase; the value of the run is used", unit)
+        values[spec.parameter] = phase.phase_rad
+    return known, sources, reasons
+
+
+def unit_parameters(
+    population: Population, calibration: PhaseCalibration | None, prefer: str, facts: RecordingFacts | None = None
+) -> Values:
+    """Return every unit's lifting parameters, as `unit_values` finds them; refuse one that is unknown."""
+    values, _, reasons = unit_values(population, calibration, prefer, facts=facts)
+    for reason in reasons.values():
+        raise IdentificationError(reason)
+    return values

@@ -5,21 +5,32 @@
 is solved by QR of ``[R; sqrt(alpha) I]``, with `alpha` added to the unnormalised Gram matrix as in the paper and in
 pykoop.
 
+Uncertainty of the estimate itself: models of resampled episodes, from what each episode was reduced to.
+
+    per-episode factors --draw episodes--> weighted restacking --EDMD--> samples of (A, B)
+
+Whole episodes are drawn, since samples of one episode depend on each other. Of E episodes E - 1 are drawn with
+replacement and each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of the
+variance (Rao and Wu, J. Am. Stat. Assoc. 83, 1988). `alpha` and the calibrated parameters stay as they are; a bias that
+all episodes share is not seen.
+
 Symbols
 -------
 R11, R12 : blocks of the factor of [Psi | Theta_plus]
 U        : Koopman matrix [A B], (n_lifted, n_lifted + m)
+w : weights of the episodes, (unit, draw, episode)
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..core.arrays import AnyArray, Array, ArrayLike, frozen
-from ..core.errors import IdentificationError
+from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
 from ..core.lti import StateSpace
 from ..core.rounding import EPS, TINY
@@ -60,9 +71,12 @@ class KoopmanMatrices:
 
     def responses(self, freqs_hz: Array, sample_period_s: float) -> AnyArray:
         """Return frequency responses from inputs to lifted states, shape (..., frequency, n, m)."""
-        n, m = self.B.shape[-2:]
-        C, D = (np.broadcast_to(M, (*self.A.shape[:-2], *M.shape)) for M in (np.eye(n), np.zeros((n, m))))
-        return StateSpace(self.A, self.B, C, D, sample_period_s).frequency_response(freqs_hz)
+        return self.systems(sample_period_s).frequency_response(freqs_hz)
+
+    def systems(self, sample_period_s: float) -> StateSpace:
+        """Return the systems from inputs to lifted states."""
+        C = np.broadcast_to(np.eye(self.A.shape[-1]), self.A.shape)
+        return StateSpace(self.A, self.B, C, np.zeros(self.B.shape), sample_period_s)
 
 
 def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
@@ -178,3 +192,45 @@ def _stable_without(factors: list[tuple[Array, int]], margin: float) -> bool:
     except IdentificationError:  # a dependent column: some regularisation is needed, however small
         log.info("some lifted data are rank deficient, so alpha = 0 is not an option")
         return False
+
+
+@frozen
+class ModelSamples:
+    """Models of resampled episodes around an estimate."""
+
+    unit_ids: tuple[str, ...]
+    estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
+    samples: KoopmanMatrices  # A (unit, draw, n, n) and B (unit, draw, n, m)
+
+    def responses(self, row: int, freqs_hz: Array, sample_period_s: float) -> AnyArray:
+        """Return frequency responses of one unit's samples, shape (draw, frequency, n, m)."""
+        return KoopmanMatrices(self.samples.A[row], self.samples.B[row]).responses(freqs_hz, sample_period_s)
+
+
+def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
+    """Draw E - 1 of E episodes with replacement, and return how much each counts: (unit, draw, max(n_episodes))."""
+    counts = [int(e) for e in n_episodes]
+    if not counts or min(counts) < 2 or draws < 2:
+        raise DataError(
+            f"Resampling episodes: needs at least two episodes of every unit and two draws, found {counts} episodes of "
+            f"the units and {draws} draws; record more, or leave the unit out."
+        )
+    weights = np.zeros((len(counts), draws, max(counts)))
+    for row, E in enumerate(counts):
+        rng = np.random.default_rng([seed, row])
+        weights[row, :, :E] = rng.multinomial(E - 1, np.full(E, 1 / E), size=draws) * (E / (E - 1))
+    return weights
+
+
+def bootstrap_edmd(
+    R: Array, n_lifted: int, alpha: float, weights: Array, unit_ids: Sequence[str] | None = None
+) -> ModelSamples:
+    """Return EDMD models of resampled episodes at a fixed alpha, from factors (unit, episode, k, k) and weights."""
+    units, episodes, width, _ = R.shape
+    models = []
+    for draw in [np.ones((units, episodes)), *np.swapaxes(weights, 0, 1)]:
+        stacked = (np.sqrt(draw)[..., None, None] * R).reshape(units, episodes * width, width)
+        models.append(edmd(qr_triangle(stacked), n_lifted, alpha))
+    drawn = KoopmanMatrices(*(np.stack([getattr(m, name) for m in models[1:]], axis=1) for name in ("A", "B")))
+    ids = tuple(map(str, range(units) if unit_ids is None else unit_ids))
+    return ModelSamples(ids, models[0], drawn)

@@ -6,7 +6,6 @@ The definition is the *local error* of the paper's section III: the lifted state
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 
 import numpy as np
 
@@ -63,20 +62,12 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Arra
         )
     lifting.window.require(n_samples)
     rows, window = np.concatenate([A, B], axis=-1)[..., :n, :], lifting.windows(first, u[:, : h + 1])[:, 0].copy()
-    loops = library()
-    run = partial(_compiled, loops) if loops is not None else _in_numpy
-    return run(rows, window, lifting, parameters, first[:, :h], u)
-
-
-def _in_numpy(
-    rows: Array, window: Array, lifting: Lifting, parameters: Mapping[str, ArrayLike], before: Array, u: Array
-) -> Array:
-    """The reference: ``x+ = [A B] psi(w)`` for the states alone, sample by sample."""
-    n, h = lifting.n_states, lifting.history
-    states = np.empty((*u.shape[:2], n))
-    states[:, :h] = before
+    if (loops := library()) is not None:
+        return _compiled(loops, rows, window, lifting, parameters, first[:, :h], u)
+    states = np.empty((batch, n_samples, n))
+    states[:, :h] = first[:, :h]
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(h, u.shape[1]):
+        for k in range(h, n_samples):  # ``x+ = [A B] psi(w)`` for the states alone
             states[:, k] = window[:, :n]
             lifted, inputs = lifting.lift(window, parameters), lifting.lift_inputs(u[:, k], window, parameters)
             window[:, n:] = lifting.window.advance(window, u[:, k])

@@ -58,14 +58,7 @@ class EpisodeFactors(Storable):
 
     def rows_of(self, unit: str) -> list[int]:
         """Return where the episodes of a unit are."""
-        return self._places.get(unit, [])
-
-    @cached_property
-    def _places(self) -> dict[str, list[int]]:
-        places: dict[str, list[int]] = {}
-        for row, (unit, _) in enumerate(self.rows):
-            places.setdefault(unit, []).append(row)
-        return places
+        return [row for row, (of, _) in enumerate(self.rows) if of == unit]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

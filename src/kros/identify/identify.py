@@ -105,19 +105,10 @@ def identify(
 
 
 def with_models(base: IdentifiedModels, settings: IdentifySettings, work: Work) -> IdentifiedModels:
-    """Return surveyed recordings, with a known lifting and its calibration, with their models."""
-    _check_conditions(base)
-    begun = {c: _begin(base, c, settings, work) for c in base.conditions}  # refined while others are identified
-    sets, factors = dict[str, ModelSet](), dict[str, EpisodeFactors]()
-    for condition, (recorded, models, refining) in begun.items():
-        factors[condition] = recorded
-        sets |= {base.place(m.name, condition): m for m in (*models, *refining())}
-    kinds = kinds_for(base.lifting, refined=settings.refine)
-    return replace(base, kinds=tuple(kinds), sets=sets, factors=factors)
+    """Return surveyed recordings, with a known lifting and its calibration, with their models.
 
-
-def _check_conditions(base: IdentifiedModels) -> None:
-    """Refuse a condition without units, and say which units were not recorded in the one that feeds synthesis."""
+    A condition without units is refused; the log names units that were not recorded in the one that feeds synthesis.
+    """
     facts = base.facts
     if facts.identify_on not in base.conditions:
         raise IdentificationError(
@@ -128,6 +119,13 @@ def _check_conditions(base: IdentifiedModels) -> None:
     if elsewhere:
         text = "Units %s were not recorded in condition %r, which feeds synthesis, and take no part in it"
         log.warning(text, ", ".join(elsewhere), facts.identify_on)
+    begun = {c: _begin(base, c, settings, work) for c in base.conditions}  # refined while others are identified
+    sets, factors = dict[str, ModelSet](), dict[str, EpisodeFactors]()
+    for condition, (recorded, models, refining) in begun.items():
+        factors[condition] = recorded
+        sets |= {base.place(m.name, condition): m for m in (*models, *refining())}
+    kinds = kinds_for(base.lifting, refined=settings.refine)
+    return replace(base, kinds=tuple(kinds), sets=sets, factors=factors)
 
 
 def _begin(
@@ -200,7 +198,12 @@ class _Reduced:
         sets = [replace(m, alpha=alpha, alpha_in_ranges=settings.alpha == "auto") for m in sets]
         models = [fitted(m, factor) for m, factor in zip(sets, factors, strict=True)]
         for m in models if self.feeds_synthesis else ():
-            require_stable(m, self.pooled)
+            for unit, status, counts in zip(m.unit_ids, m.status, self.pooled, strict=True):
+                if counts and status != "ok":
+                    raise IdentificationError(
+                        f"Identifying {m.name} of unit {unit} ({m.condition}) with alpha = {m.alpha:g}: the "
+                        f"model is {status}; set identify.alpha = 'auto', or raise it."
+                    )
         return models
 
     def _unfitted(self, kind: str, lifting: Lifting) -> ModelSet:
@@ -227,7 +230,13 @@ class _Reduced:
         triangles = [m.ranges.triangles(factor.R[rows]) for m, factor in zip(sets, factors, strict=True)]
         shared = [(R, m.lifting.n_lifted) for R, m in zip(triangles, sets, strict=True)]
         edge = smallest_stabilising_alpha(shared)
-        times = alpha_factor(shared, edge) if self.feeds_synthesis else AlphaSearch().factor
+        search, limit = AlphaSearch(), RefineOptions().largest_residual
+        times = search.factor
+        for doubled in range(search.doublings if self.feeds_synthesis and edge > 0 else 0):  # until models are alike
+            models = [edmd(R, n, search.factor * 2.0**doubled * edge) for R, n in shared]
+            if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):
+                times = search.factor * 2.0**doubled
+                break
         note = (
             "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
         )
@@ -260,24 +269,3 @@ def fitted(models: ModelSet, factor: Factor) -> ModelSet:
     radius = models.ranges.normalise(matrices).spectral_radius()
     status = tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius)
     return replace(models, A=matrices.A, B=matrices.B, status=status)
-
-
-def alpha_factor(shared: list[tuple[Array, int]], edge: float) -> float:
-    """Return how many times the smallest stabilising alpha is taken: doubled until models are alike."""
-    search, limit = AlphaSearch(), RefineOptions().largest_residual
-    for doubled in range(search.doublings if edge > 0 else 0):
-        factor = search.factor * 2.0**doubled
-        models = [edmd(R, n, factor * edge) for R, n in shared]
-        if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):
-            return factor
-    return search.factor
-
-
-def require_stable(models: ModelSet, pooled: Flags) -> None:
-    """Refuse unstable models where they feed the synthesis."""
-    for unit, status, counts in zip(models.unit_ids, models.status, pooled, strict=True):
-        if counts and status != "ok":
-            raise IdentificationError(
-                f"Identifying {models.name} of unit {unit} ({models.condition}) with alpha = {models.alpha:g}: the "
-                f"model is {status}; set identify.alpha = 'auto', or raise it."
-            )

@@ -157,9 +157,7 @@ class ModelSet(Shown, Storable):
     def systems(self, units: Sequence[str] | None = None) -> StateSpace:
         """Return the models as a batch from input to lifted state, all of it or some units."""
         rows = [self.index(u) for u in units] if units is not None else slice(None)
-        A, B = self.A[rows], self.B[rows]
-        n, m = B.shape[-2:]
-        return StateSpace(A, B, np.broadcast_to(np.eye(n), A.shape), np.zeros((len(A), n, m)), self.sample_period_s)
+        return KoopmanMatrices(self.A[rows], self.B[rows]).systems(self.sample_period_s)
 
     def frequencies(self, n_freqs: int = 1000, decades: float = 6.0) -> Array:
         """Return logarithmic frequencies, Hz, from what the longest episode resolves up to Nyquist."""

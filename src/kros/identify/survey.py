@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, fields, replace
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..core.arrays import Array
-from ..core.artifacts import file_digest, load_artifact, loader, united
+from ..core.artifacts import Storable, divided, file_digest
 from ..core.errors import DataError
 from ..core.files import is_file, link_or_copy
 from ..core.rounding import ITERATED
@@ -41,9 +41,10 @@ _PARTS = ("train", "test")
 
 
 @dataclass(frozen=True)
-class RecordingFacts:
+class RecordingFacts(Storable):
     """What is known about recordings once all were read."""
 
+    KIND = "facts"
     identify_on: str  # condition whose models feed synthesis
     groups: dict[str, str]
     train: tuple[EpisodeKey, ...]
@@ -52,7 +53,7 @@ class RecordingFacts:
     dropped: tuple[str, ...] = ()  # episodes that were left out, with the reason
     alerts: tuple[str, ...] = ()  # what looks wrong in the recordings without making them unusable
     reserve: tuple[str, ...] = ()
-    digests: Mapping[EpisodeKey, str] = field(default_factory=dict)
+    digests: tuple[str, ...] = ()  # of the samples of the training episodes, then of the test episodes
 
     @cached_property
     def pooled(self) -> tuple[str, ...]:
@@ -75,22 +76,16 @@ class RecordingFacts:
 
     def marks(self, keys: Iterable[EpisodeKey]) -> tuple[str, ...]:
         """Return the digests of some episodes."""
-        return tuple(self.digests[key] for key in keys)
+        return tuple(self._digests[key] for key in keys)
+
+    @cached_property
+    def _digests(self) -> dict[EpisodeKey, str]:
+        return dict(zip((*self.train, *self.test), self.digests, strict=False))
 
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
-        facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        facts["digests"] = {part: self.marks(facts[part]) for part in _PARTS}
-        return facts | {part: [astuple(key) for key in facts[part]] for part in _PARTS}
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> RecordingFacts:
-        """Read what a study's stage `read`, or a saved result, keeps in its folder ``population``."""
-        content, _ = load_artifact(folder, "facts")
-        parts = {part: [EpisodeKey(*row) for row in content[part]] for part in _PARTS}
-        pairs = [pair for part in _PARTS for pair in zip(parts[part], content["digests"][part], strict=True)]
-        return united(cls, {**content, **parts, "digests": dict(pairs)}, {})
+        content: dict[str, Any] = divided(self)[0]
+        return content
 
 
 @dataclass(frozen=True)
@@ -165,7 +160,13 @@ def survey(
             "read", _read_group, tasks, marks, _GroupFacts, lambda _, known: copy is None or copy.reuse(known)
         )
     )
-    retained = _retained(population, groups, folder)
+    if folder is None:
+        digests = {e.key: e.digest for group in groups for e in group.episodes}
+        refuse_copies(digests.items())
+        retained = replace(population, episodes=tuple(k for k in population.episodes if k in digests))
+    else:
+        write_index(population, [g.record for g in groups if g.record is not None], folder, converted=False)
+        retained = read_parquet(folder)
     facts = _facts(population, retained, groups, chosen)
     for alert in facts.alerts:
         log.warning("%s", alert)
@@ -182,16 +183,18 @@ def _facts(
     if short := [f"{title(e.key)} has {e.n_samples}" for e in episodes if e.n_samples < options.fewest]:
         needs = f"every episode needs at least {options.fewest} samples after preparation"
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
+    train, test = (tuple(k for s in splits.values() for k in getattr(s, name)) for name in _PARTS)
+    digests = {e.key: e.digest for e in episodes}
     return RecordingFacts(
         identify_on=condition_of(population.select(part), options.identify_on),
         groups=groups,
-        train=tuple(k for s in splits.values() for k in s.train),
-        test=tuple(k for s in splits.values() for k in s.test),
+        train=train,
+        test=test,
         resolution={m: min(g.resolution[m] for g in read) for m in retained.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
         alerts=(*period_alerts(retained.sample_period_s), *_unlike(retained, read, groups)),
         reserve=tuple(options.reserve),
-        digests={e.key: e.digest for e in episodes},
+        digests=tuple(digests[key] for key in train + test),
     )
 
 
@@ -252,13 +255,3 @@ def smallest_step(signal: Array) -> float:
     steps, floor = np.abs(np.diff(signal)), ITERATED * float(np.abs(signal).max())
     smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
     return smallest if np.isfinite(smallest) else floor
-
-
-def _retained(population: Population, groups: Sequence[_GroupFacts], folder: Path | None) -> Population:
-    """Return the population of usable episodes, that of the copy where there is one."""
-    if folder is not None:
-        write_index(population, [g.record for g in groups if g.record is not None], folder, converted=False)
-        return read_parquet(folder)
-    digests = {e.key: e.digest for group in groups for e in group.episodes}
-    refuse_copies(digests.items())
-    return replace(population, episodes=tuple(k for k in population.episodes if k in digests))

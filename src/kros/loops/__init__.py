@@ -7,7 +7,6 @@ none, the callers go on in NumPy, which is also what tests compare with.
 
 from __future__ import annotations
 
-from .filtering import recursion
-from .library import Library, formulas, library
+from .library import Library, formulas, library, recursion
 
 __all__ = ["Library", "formulas", "library", "recursion"]

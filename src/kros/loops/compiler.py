@@ -54,7 +54,7 @@ def load(source: str, flags: tuple[str, ...]) -> ctypes.CDLL | None:
     return None
 
 
-def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS, cwd: str | None = None) -> str:
+def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS) -> str:
     """Run a tool in a process group that ends in time; return what it printed, or raise with the reason in a line."""
     with subprocess.Popen(
         command,
@@ -62,7 +62,6 @@ def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
-        cwd=cwd,
         text=True,
         errors="replace",
     ) as running:

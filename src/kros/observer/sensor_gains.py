@@ -17,7 +17,7 @@ from ..core.arrays import Array
 from ..core.lti import StateSpace
 from ..core.norms import gramian
 from ..core.rounding import AGREED
-from ..loops.filtering import recursion
+from ..loops.library import recursion
 from .data import ObserverData
 
 BLOCK = 4096  # samples of an impulse response that are in memory

@@ -8,9 +8,8 @@ Examples
 """
 
 from .batch import SimulatedPopulation
-from .dc_motor import DcMotorPopulation
 from .harmonic_drive.population import HarmonicDrivePopulation
-from .pendulum import PendulumPopulation
+from .small_plants import DcMotorPopulation, PendulumPopulation
 
 PLANTS = {"harmonic-drive": HarmonicDrivePopulation, "pendulum": PendulumPopulation, "dc-motor": DcMotorPopulation}
 

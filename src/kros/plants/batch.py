@@ -11,10 +11,11 @@ import numpy as np
 
 from ..core.arrays import Array, frozen
 from ..core.errors import ConfigError
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Unit
+from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ..data.prepare import assemble
 from ..data.recording import Recording, Recordings
 
+POSITION, VELOCITY = Channel("position", Role.STATE, "rad", measured=True), Channel("velocity", Role.STATE, "rad/s")
 COUNT_RAD = 2 * np.pi / 4096  # of the encoder
 INPUT_STREAM, UNIT_STREAM, OUTLIER_STREAM, NOISE_STREAM = range(4)  # first words of spawn keys
 _LIMITS: dict[str, tuple[float, float]] = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..core.artifacts import load_artifact, plain
-from ..evaluate.intervals import interval_rows
+from ..evaluate.over_units import interval_rows
 from ..observer import Observer
 from ..observer.sensor_gains import sensor_gains
 from ..synthesis.result import Synthesis

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from .mixed_norms.mixed import mixed
     from .problem.observer_problem import ObserverProblem
     from .result import Injection, Status, Synthesis
-    from .riccati.h2 import h2
+    from .riccati.h2 import h2, kalman
     from .riccati.hinf import hinf
-    from .riccati.kalman import kalman
     from .worst_case.worst_case_h2 import worst_case_h2
 
 _HOME = {
@@ -36,7 +35,7 @@ _HOME = {
     "Synthesis": "result",
     "h2": "riccati.h2",
     "hinf": "riccati.hinf",
-    "kalman": "riccati.kalman",
+    "kalman": "riccati.h2",
     "mixed": "mixed_norms.mixed",
     "worst_case_h2": "worst_case.worst_case_h2",
 }

@@ -34,12 +34,16 @@ PROPER = "D11 = 0 in continuous time", "use a strictly proper weight"
 
 def unreachable_modes(A: AnyArray, B: AnyArray, dt: float) -> list[complex]:
     """Return the eigenvalues on or beyond the stability boundary that B does not reach (Hautus test)."""
-    A, B = _balanced(A, B)
+    if A.size:  # A is balanced and B made as large as A, so that the test does not depend on units
+        size = balanced_size(A)
+        A, B = A * size / size[:, None], B / size[:, None]
+        sizes = np.linalg.norm(B, axis=0)
+        B = B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), TINY)
     modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
     outside = modes[np.abs(modes) >= 1 - ROUNDING] if dt > 0 else modes[modes.real >= -ROUNDING * (1 + np.abs(modes))]
     pencils = (np.hstack([A - mode * np.eye(len(A)), B]) for mode in outside)
-    sizes = (np.linalg.svd(pencil, compute_uv=False) for pencil in pencils)
-    return [complex(mode) for mode, s in zip(outside, sizes, strict=True) if s[-1] <= ITERATED * max(s[0], TINY)]
+    values = (np.linalg.svd(pencil, compute_uv=False) for pencil in pencils)
+    return [complex(mode) for mode, s in zip(outside, values, strict=True) if s[-1] <= ITERATED * max(s[0], TINY)]
 
 
 def h2_violations(plant: GeneralizedPlant, proper: bool) -> dict[tuple[str, str], str]:
@@ -75,16 +79,6 @@ def require_detectable(A: AnyArray, C: AnyArray, dt: float, method: str) -> None
     if modes:
         problem = f"mode {modes[0]:.6g} is on or outside the unit circle and invisible in y"
         raise SynthesisError(f"{method}: (A, C) is not detectable, {problem}; measure another state.")
-
-
-def _balanced(A: AnyArray, B: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Balance A and make B as large as A, so that a test does not depend on units."""
-    if not A.size:
-        return A, B
-    size = balanced_size(A)
-    A, B = A * size / size[:, None], B / size[:, None]
-    sizes = np.linalg.norm(B, axis=0)
-    return A, B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), TINY)
 
 
 def _rank(matrix: AnyArray) -> int:

@@ -14,9 +14,9 @@ Examples
 
 from ..core.linalg import sigma_max
 from ..core.removed import refusing
+from .bounded import choose_nominal
 from .forms import Form, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
-from .nominal import choose_nominal
 from .outliers.model import OutlierModel, score_outliers
 from .quantify import UncertainModels, quantify
 from .weights.magnitude import fit_magnitude

@@ -30,6 +30,7 @@ import numpy as np
 from ..core.arrays import AnyArray, ArrayLike
 from ..core.errors import DataError, DimensionError
 from ..core.linalg import sigma_max
+from ..core.rounding import EPS
 from ..core.settings import member
 from .settings import SET
 
@@ -107,7 +108,10 @@ def residual(form: Form | str, nominal: ArrayLike, perturbed: ArrayLike, *, pape
            [0. , 0. ]])
     """
     form = as_form(form)
-    G, Gp = _plants(nominal, perturbed)
+    G, Gp = np.asarray(nominal), np.asarray(perturbed)
+    if G.ndim < 2 or Gp.ndim < 2 or G.shape[-2:] != Gp.shape[-2:]:
+        problem = f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}"
+        raise DimensionError(f"{problem}; bring them to the same channels.")
     if not paper or form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
         return residual_of(form, G, Gp, np.linalg.pinv)
     inverse, other = (np.linalg.pinv(Gp), G) if form.inverse else (np.linalg.pinv(G), Gp)
@@ -139,7 +143,9 @@ def rebuild(form: Form | str, nominal: ArrayLike, E: ArrayLike) -> AnyArray:
     if not form.inverse:
         return G + change_of(form, G, E)
     loop = loop_of(form, G, E)
-    inverse = _inverse(np.eye(loop.shape[-1]) - loop)
+    one = np.eye(loop.shape[-1])
+    regular = (np.linalg.cond(one - loop) < 1 / EPS)[..., None, None]
+    inverse = np.where(regular, np.linalg.inv(np.where(regular, one - loop, one)), np.nan)
     return G @ inverse if form.at_input else inverse @ G
 
 
@@ -216,17 +222,3 @@ def check_responses(responses: Any, ids: Sequence[str] | None = None, freqs_hz: 
         problem = f"that of unit {names[unit]!r} has NaN or infinity at {place}, {int((~finite).sum())} in all"
         raise DataError(f"Responses: {problem}; leave the unit out, or look at its model.")
     return G
-
-
-def _plants(nominal: ArrayLike, perturbed: ArrayLike) -> tuple[AnyArray, AnyArray]:
-    G, Gp = np.asarray(nominal), np.asarray(perturbed)
-    if G.ndim < 2 or Gp.ndim < 2 or G.shape[-2:] != Gp.shape[-2:]:
-        problem = f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}"
-        raise DimensionError(f"{problem}; bring them to the same channels.")
-    return G, Gp
-
-
-def _inverse(matrices: AnyArray) -> AnyArray:
-    """Inverses, NaN where a matrix is singular."""
-    regular = (np.linalg.cond(matrices) < 1 / np.finfo(float).eps)[..., None, None]
-    return np.where(regular, np.linalg.inv(np.where(regular, matrices, np.eye(matrices.shape[-1]))), np.nan)

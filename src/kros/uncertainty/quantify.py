@@ -23,11 +23,9 @@ from ..core.work import Work
 from ..data.shown import Shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
-from .bounded import bound_responses, bound_systems
+from .bounded import Options, bound_responses, bound_systems, choose_nominal, read_response_data
 from .forms import Form, as_form, residual
-from .inputs import Options, read_response_data
 from .model import UncertainModel
-from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import QuantifySettings, WeightSettings
@@ -186,16 +184,12 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
     tasks = [partial(bound_systems, *one, options) for one in every]
     sets = dict(zip(models.kinds, work.run("quantify", tasks), strict=True))
-    worst_off = worst_off_nominal(first, sets[models.kinds[0]])
-    return UncertainModels(models, nominal, worst_off, sets, tuple(scores), outliers)
-
-
-def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:
-    """Return the unit with the largest residual against the nominal one."""
-    responses = models.scaled_responses(uncertain.freqs_hz, uncertain.unit_ids)
+    uncertain = sets[first.name]
+    responses = first.scaled_responses(uncertain.freqs_hz, uncertain.unit_ids)
     peaks = sigma_max(residual(uncertain.form, responses[uncertain.nominal], responses)).max(axis=-1)
     peaks[uncertain.nominal] = -np.inf
-    return uncertain.unit_ids[int(np.argmax(peaks))]
+    worst_off = uncertain.unit_ids[int(np.argmax(peaks))]  # the unit with the largest residual against the nominal one
+    return UncertainModels(models, nominal, worst_off, sets, tuple(scores), outliers)
 
 
 def residuals_beside_weights(models: ModelSet, uncertain: UncertainModel, points: int = 240) -> UnitResiduals:

@@ -26,7 +26,7 @@ from ...observer.data import ObserverData
 from ...observer.estimator.certificate import linear_part
 from ...observer.sensor import delay_of
 from ...synthesis import ObserverProblem
-from ...synthesis.problem.interconnect import interconnect
+from ...synthesis.generalized_plant import interconnect
 from ...uncertainty import Form, UncertainModel
 from .small_gain import Blocks
 
@@ -53,7 +53,7 @@ class LinearLoop:
     def perturbed(self) -> Blocks:
         """Return the loop of the nominal between the blocks of the perturbation, behind them that from r to e."""
         problem = self.problem
-        both = [(problem.W_L, problem.W_R, problem.location)]
+        both = [(problem.W_L, problem.W_R, problem.form)]
         if problem.remainder_left is not None and problem.remainder_right is not None:
             both.append((problem.remainder_left, problem.remainder_right, Form.ADDITIVE))
         return self.around(problem.scaled_model, both)

@@ -28,7 +28,7 @@ from ..free_run import free_run
 from .metric import ResponsePrior, peak_residual
 from .problem import OneStep, RefinementProblem, stability_barrier
 from .search import GaussNewton, RefineOptions, Solution
-from .segments import Segments, TrainingData, held_segments, read_segments
+from .sensitivity import Segments, TrainingData, held_segments, read_segments
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +96,9 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     start, problem = start_pooled(data, fitted, options)
     one_model = problem.of_one_model(data.rows)
     common = refine_pooled(start, one_model)
-    problem = _around(problem, one_model, common)
+    pooled = problem.matrices(common)
+    prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
+    problem = replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
     path, scores, peaks = _path(data, problem, common)
     choice = _choose(scores, peaks, options)
     strength = options.strengths[choice]
@@ -104,16 +106,14 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     final = replace(problem, segments=segments).with_prior(strength)
     solution = _fit(final, path[choice], replace(options.search, iterations=options.final_iterations))
     models = final.matrices(solution.V)
-    _require_stable(tuple(data.keys), models.spectral_radius(), options.margin)
+    for unit, radius in zip(data.keys, models.spectral_radius(), strict=True):
+        if not radius < 1 - options.margin:
+            raise IdentificationError(
+                f"Refinement: the model of unit {unit} has spectral radius {radius_text(radius)}, not below "
+                f"{radius_text(1 - options.margin)}; use a stronger prior."
+            )
     require_bounded(data, models, options.bound)
     return models
-
-
-def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Array) -> RefinementProblem:
-    """Return the problem of all units with errors in units of those of the pooled model, and a prior around it."""
-    options, pooled = problem.options, problem.matrices(common)
-    prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
-    return replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
 
 
 def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], Array, Array]:
@@ -121,12 +121,16 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
     options = problem.options
     search = replace(options.search, iterations=options.path_iterations)
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
+    pooled, last = data.rows, [episodes[-1] for episodes in data.keys.values()]
+    held = [last[row] for row in pooled]
     path: list[Array] = []
     rows: list[tuple[float, float]] = []
     for strength in options.strengths:
         V = _fit(problem.with_prior(strength), V, search).V
         path.append(V)
-        rows.append(trade_off(data, problem, V))
+        models = problem.matrices(V[pooled])
+        rms, _ = free_run_errors(data, models, pooled.tolist(), held)
+        rows.append((float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)))
         log.debug("prior of strength %g: score %.4g, peak residual %.3g", strength, *rows[-1])
         earlier = rows[-1 - options.patience][0] if len(rows) > options.patience else np.inf
         if rows[-1][0] > (1 - options.tolerance / 2) * earlier or rows[-1][1] > options.largest_residual:
@@ -155,15 +159,6 @@ def _choose(scores: Array, peaks: Array, options: RefineOptions) -> int:
     choice = int(np.argmax(scores <= (1 + options.tolerance) * best))
     free = [i for i in range(choice, len(scores)) if peaks[i] <= options.negligible_residual]
     return min(free, key=lambda i: scores[i], default=choice)
-
-
-def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> None:
-    for unit, value in zip(unit_ids, radius, strict=True):
-        if not value < 1 - margin:
-            raise IdentificationError(
-                f"Refinement: the model of unit {unit} has spectral radius {radius_text(value)}, not below "
-                f"{radius_text(1 - margin)}; use a stronger prior."
-            )
 
 
 def start_pooled(data: TrainingData, segments: Segments, options: RefineOptions) -> tuple[Array, RefinementProblem]:
@@ -237,16 +232,16 @@ _TOGETHER = 32  # episodes, as many as the compiled loop runs side by side
 
 
 def free_run_errors(
-    models: KoopmanMatrices,
-    lifting: Lifting,
-    parameters: Mapping[str, Array],
-    population: Population,
-    keys: Sequence[EpisodeKey],
+    data: TrainingData, models: KoopmanMatrices, rows: Sequence[int], keys: Sequence[EpisodeKey]
 ) -> tuple[Array, Array]:
-    """Return RMS errors of free runs, and the largest values that they reach, both (episode, n)."""
+    """Return RMS errors of free runs over episodes of some rows of the data, and the largest values, both (episode, n).
+
+    There is a model for every episode.
+    """
+    lifting, parameters = data.lifting, {name: given[rows] for name, given in data.parameters.items()}
     errors = []
     for part in (slice(start, start + _TOGETHER) for start in range(0, len(keys), _TOGETHER)):
-        batch = EpisodeBatch.read(population, keys[part])
+        batch = EpisodeBatch.read(data.population, keys[part])
         values = {name: given[part] for name, given in parameters.items()}
         x, u = (np.ascontiguousarray(np.swapaxes(signal, 0, 1)) for signal in (batch.states, batch.inputs))
         runs = free_run(models.A[part], models.B[part], lifting, values, x[:, : lifting.history + 1], u)
@@ -263,20 +258,8 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
     """Refuse models whose free runs over a training episode leave the bound, in ranges of the states."""
     rows = [row for row, episodes in enumerate(data.keys.values()) for _ in episodes]
     keys = [key for episodes in data.keys.values() for key in episodes]
-    values = {name: given[rows] for name, given in data.parameters.items()}
-    each = KoopmanMatrices(models.A[rows], models.B[rows])
-    _, reached = free_run_errors(each, data.lifting, values, data.population, keys)
+    _, reached = free_run_errors(data, KoopmanMatrices(models.A[rows], models.B[rows]), rows, keys)
     for which, state in np.argwhere(~(reached <= bound)):
         size = f"{reached[which, state]:.3g} times the range of {data.lifting.states[state]!r}, beyond {bound:g}"
         remedy = "use functions that stay bounded, drop the episode, or set identify.refine = false"
         raise IdentificationError(f"Refinement: the free run over {keys[which]} reaches {size}; {remedy}.")
-
-
-def trade_off(data: TrainingData, problem: RefinementProblem, V: Array) -> tuple[float, float]:
-    """Return the error on held-out training episodes and the peak residual of models (unit, n_lifted, p) or of one."""
-    rows, count = data.rows, len(data.keys)
-    models = problem.matrices(np.broadcast_to(V, (count, *V.shape[-2:]))[rows])
-    last = [episodes[-1] for episodes in data.keys.values()]
-    values = {name: given[rows] for name, given in data.parameters.items()}
-    rms, _ = free_run_errors(models, data.lifting, values, data.population, [last[row] for row in rows])
-    return float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)

@@ -32,8 +32,7 @@ from ..edmd import KoopmanMatrices
 from ..factors import Factor
 from .metric import ResponsePrior
 from .search import RefineOptions
-from .segments import Segments
-from .sensitivity import Normal, normal_equations
+from .sensitivity import Normal, Segments, normal_equations
 
 
 @frozen
@@ -54,12 +53,8 @@ class OneStep:
         white = np.concatenate([factor.R[..., :p] @ T, factor.R[..., p + n_states :]], axis=-1)
         matrix = np.swapaxes(white, -1, -2) @ white / factor.n_samples[:, None, None]
         mean = matrix[pooled].mean(axis=0)
-        rows = np.linalg.lstsq(mean[:p, :p], mean[:p, p:], rcond=None)[0].T
-        left = np.diagonal(mean[p:, p:]) - np.sum(rows * mean[:p, p:].T, axis=1)
-        best = np.stack([np.linalg.lstsq(M[:p, :p], M[:p, p:], rcond=None)[0].T for M in matrix])
-        explained = np.sum(best * np.swapaxes(matrix[:, :p, p:], 1, 2), axis=2)
-        least = np.diagonal(matrix[:, p:, p:], axis1=1, axis2=2) - explained
-        return cls(matrix, least, np.maximum(left, least_variance * np.diagonal(mean[p:, p:])))
+        least = np.stack([_unexplained(M, p) for M in matrix])
+        return cls(matrix, least, np.maximum(_unexplained(mean, p), least_variance * np.diagonal(mean[p:, p:])))
 
     def normal(self, rows: Array, row: int) -> Array:
         """Return ``[J r]^T [J r]`` of one function for rows (unit, p), per sample and in units of its variance."""
@@ -164,6 +159,12 @@ class RefinementProblem:
         if self.prior is not None:
             total += self.prior.normal(V)
         return total
+
+
+def _unexplained(M: Array, p: int) -> Array:
+    """Return the mean squares of functions that the best rows leave, from the matrix of all products."""
+    rows = np.linalg.lstsq(M[:p, :p], M[:p, p:], rcond=None)[0].T
+    return np.diagonal(M[p:, p:]) - np.sum(rows * M[:p, p:].T, axis=1)
 
 
 def _add(total: Array, part: Array, place: slice) -> None:

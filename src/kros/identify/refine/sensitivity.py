@@ -8,6 +8,8 @@ of states and inputs that the lifting reads. Lifted states are re-lifted at ever
 where the columns of T whiten the data; all least squares is done in V, whose entries are of one size. Without delays d
 is 0 alone. Values that were recorded, all inputs and the states of the first window, do not move with the model.
 
+Training data, and stretches of its episodes: drawn once, cut into shorter pieces for shorter horizons.
+
 Symbols
 -------
 V       : free parameters, (unit, n, p), with p = n_lifted + m, input functions counted;   T : whitening, (p, p)
@@ -18,14 +20,132 @@ normal  : ``[J r]^T [J r]`` of every unit, (unit, n p + 1, n p + 1), over the re
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, frozen
+from ...core.arrays import AnyArray, Array, Flags, Whole, frozen
+from ...core.errors import DataError
+from ...data.population import EpisodeKey, Population
+from ...data.prepare import scale_population
 from ...lifting import Lifting
 from ...loops import Library, formulas, library
-from .segments import Segments
+from ..factors import Factor, Ranges
+
+Keys = Mapping[str, Sequence[EpisodeKey]]
+
+
+@frozen
+class TrainingData:
+    """Training episodes of every unit with their factors; the units that are `pooled` speak for the population."""
+
+    population: Population
+    keys: Keys
+    lifting: Lifting
+    parameters: Mapping[str, Array]  # (unit,)
+    factor: Factor  # batch over units
+    pooled: Flags  # (unit,)
+
+    @property
+    def rows(self) -> Whole:
+        """Rows of the pooled units."""
+        return np.flatnonzero(self.pooled)
+
+    def divided_by(self, ranges: Ranges) -> TrainingData:
+        """Return the data of channels divided by ranges."""
+        sizes = ranges.sizes(self.lifting, self.population.inputs)
+        return replace(
+            self,
+            population=scale_population(self.population, sizes),
+            lifting=self.lifting.in_sizes(sizes),
+            factor=ranges.factor(self.factor),
+        )
+
+
+@frozen
+class Segments:
+    """Stretches of recordings, the same number for every unit."""
+
+    states: Array  # (n_samples, n, unit, segment)
+    inputs: Array  # (n_samples, m, unit, segment)
+    valid: Flags  # (n_samples, unit, segment)
+    history: int = 0
+
+    @property
+    def n_units(self) -> int:
+        """Number of units."""
+        return self.valid.shape[1]
+
+    @property
+    def horizon(self) -> int:
+        """Steps of a free run."""
+        return len(self.valid) - 1 - self.history
+
+    @property
+    def compared(self) -> Flags:
+        """Which samples a free run is compared with, shape (horizon, unit, segment)."""
+        return self.valid[self.history + 1 :]
+
+    def units(self, rows: AnyArray) -> Segments:
+        """Return the segments of some units."""
+        return self._each(lambda values: values[..., rows, :])
+
+    def first(self, count: int) -> Segments:
+        """Return the first segments of every unit."""
+        return self._each(lambda values: values[..., :count])
+
+    def cut(self, horizon: int) -> Segments:
+        """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them."""
+        length = min(horizon, self.horizon) + 1
+        pieces, n_segments = (len(self.valid) - self.history) // length, self.valid.shape[2]
+        spread = np.unique(np.linspace(0, pieces * n_segments - 1, n_segments).round().astype(int))
+        samples = np.arange(self.history + length)[:, None] + length * np.arange(pieces)  # (sample, piece)
+
+        def fold(values: AnyArray) -> AnyArray:
+            moved = np.moveaxis(values[samples], 1, -1)  # (sample, .., segment, piece)
+            return moved.reshape(*moved.shape[:-2], -1)[..., spread]
+
+        return self._each(fold)
+
+    def _each(self, change: Callable[[AnyArray], AnyArray]) -> Segments:
+        states, inputs, valid = (np.ascontiguousarray(change(a)) for a in (self.states, self.inputs, self.valid))
+        return Segments(states, inputs, valid, self.history)
+
+
+def read_segments(
+    population: Population, keys: Keys, horizon: int, count: int, seed: int, history: int = 0
+) -> Segments:
+    """Draw segments of every unit, those of its last episode at the end."""
+    n, width, length = len(population.states), len(population.channels), history + horizon + 1
+    values = np.empty((length, width, len(keys), count))
+    valid = np.ones((length, len(keys), count), dtype=bool)
+    for row, (unit, episodes) in enumerate(keys.items()):
+        if not episodes:
+            raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out.")
+        rng = np.random.default_rng([seed, row])
+        earlier, held = max(1, len(episodes) - 1), held_segments(count, keys)
+        owners = np.array([*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held])
+        for episode in dict.fromkeys(owners.tolist()):
+            key = episodes[episode]
+            samples = population.read(key)
+            if len(samples) < history + 2:
+                problem = f"{key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}"
+                raise DataError(f"Refinement: {problem}; leave the episode out or use shorter delays.")
+            for column in np.flatnonzero(owners == episode):
+                start = int(rng.integers(0, max(1, len(samples) - length + 1)))
+                piece = samples[start : start + length]
+                values[: len(piece), :, row, column] = piece
+                values[len(piece) :, :, row, column] = piece[-1]
+                valid[len(piece) :, row, column] = False
+    return Segments(np.ascontiguousarray(values[:, :n]), np.ascontiguousarray(values[:, n:]), valid, history)
+
+
+def held_segments(count: int, keys: Keys) -> int:
+    """Return how many of the segments come from the last episode: its share, at least one where there are two."""
+    typical = int(np.median([len(episodes) for episodes in keys.values()])) if keys else 1
+    return min(count - 1, max(1, round(count / max(1, typical)))) if count > 1 else 0
+
 
 Past = tuple[int, int, int]
 _AT_ONCE = 500_000  # numbers in memory: residuals and how they move
@@ -91,12 +211,38 @@ class _Run:
     def rows(self, window: Array) -> Iterator[Array]:
         """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from a window on."""
         n, p, batch = self.W.shape
-        past = _moving_past(self.lifting)
+        lifting, window_of = self.lifting, self.lifting.window
+        read = {name for formula in (*lifting.formulas, *lifting.input_formulas) for name in formula.used}
+        past = [  # earlier values of states that a formula reads: entry of the window, state and delay
+            (entry, lifting.states.index(quantity), delay)
+            for entry, (quantity, delay) in enumerate(window_of.quantities)
+            if delay and window_of.names[entry] in read and quantity in lifting.states
+        ]
         S = np.zeros(
             (2 + max((d for _, _, d in past), default=0), n, n * p, batch)
         )  # now, earlier, and space for the next
-        loops = library()
-        return self._in_numpy(window, S, past) if loops is None else self._compiled(loops, window, S, past)
+        if (loops := library()) is not None:
+            yield from self._compiled(loops, window, S, past)
+            return
+        nl, h = lifting.n_lifted, lifting.history
+        psi, recent = np.empty((p, batch)), list(S)
+        psi[:n] = window[:n]
+        for k in range(h, len(self.x) - 1):
+            u = self.u[k]
+            psi[:nl] = lifting.lift(window.T, self.parameters).T
+            psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
+            terms = np.stack([*recent[0], *(recent[delay][state] for _, state, delay in past)])
+            following = np.einsum("abj,bqj->aqj", self._state_matrix(window, u, past), terms)
+            following.reshape(n, n, p, batch)[range(n), range(n)] += self.T.T @ psi
+            window[n:] = lifting.window.advance(window.T, u.T).T
+            psi[:n] = window[:n] = np.einsum("apb,pb->ab", self.W, psi)
+            recent = [following, *recent[:-1]]
+            if (k + 1 - h) % self.stride == 0:
+                error = self.x[k + 1] - psi[:n]
+                rows = np.concatenate([following, error[:, None]], axis=1) / self.sigma[:, None, None]
+                rows[:, :, ~self.valid[k + 1]] = 0.0
+                by_unit = rows.reshape(n, n * p + 1, self.units, batch // self.units).transpose(2, 1, 0, 3)
+                yield by_unit.reshape(self.units, n * p + 1, -1)
 
     def _compiled(self, loops: Library, window: Array, S: Array, past: Sequence[Past]) -> Iterator[Array]:
         (n, p, batch), lifting, h, m = self.W.shape, self.lifting, self.lifting.history, self.u.shape[1]
@@ -124,23 +270,6 @@ class _Run:
             loops.call("kros_sensitivities", of_lifting, ("sensitivity_job", job | part))
             yield J
 
-    def _in_numpy(self, window: Array, S: Array, past: Sequence[Past]) -> Iterator[Array]:
-        (n, p, batch), lifting, nl, h = self.W.shape, self.lifting, self.lifting.n_lifted, self.lifting.history
-        psi, recent = np.empty((p, batch)), list(S)
-        psi[:n] = window[:n]
-        for k in range(h, len(self.x) - 1):
-            u = self.u[k]
-            psi[:nl] = lifting.lift(window.T, self.parameters).T
-            psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
-            terms = np.stack([*recent[0], *(recent[delay][state] for _, state, delay in past)])
-            following = np.einsum("abj,bqj->aqj", self._state_matrix(window, u, past), terms)
-            following.reshape(n, n, p, batch)[range(n), range(n)] += self.T.T @ psi
-            window[n:] = lifting.window.advance(window.T, u.T).T
-            psi[:n] = window[:n] = np.einsum("apb,pb->ab", self.W, psi)
-            recent = [following, *recent[:-1]]
-            if (k + 1 - h) % self.stride == 0:
-                yield self._residuals(recent[0], self.x[k + 1] - psi[:n], self.valid[k + 1])
-
     def _state_matrix(self, window: Array, u: Array, past: Sequence[Past]) -> Array:
         """F = W d psi/dw, shape (n, n + q, batch)."""
         lifting, W, n, nl = self.lifting, self.W, self.lifting.n_states, self.lifting.n_lifted
@@ -154,22 +283,3 @@ class _Run:
             slopes = lifting.slopes(window.T, self.parameters, u=u.T)[..., moving]
             F += np.einsum("afb,bfj->ajb", W[:, nl + len(u) :], slopes)
         return F
-
-    def _residuals(self, S: Array, error: Array, valid: Flags) -> Array:
-        """``[J r]^T`` of one sample; J = dx/dV / sigma."""
-        rows = np.concatenate([S, error[:, None]], axis=1) / self.sigma[:, None, None]  # (n, n p + 1, batch)
-        rows[:, :, ~valid] = 0.0
-        n, width, batch = rows.shape
-        by_unit = rows.reshape(n, width, self.units, batch // self.units).transpose(2, 1, 0, 3)
-        return by_unit.reshape(self.units, width, -1)
-
-
-def _moving_past(lifting: Lifting) -> list[Past]:
-    """Earlier values of states that a formula reads: entry of the window, state and delay."""
-    read = {name for formula in (*lifting.formulas, *lifting.input_formulas) for name in formula.used}
-    window, states = lifting.window, lifting.states
-    return [
-        (entry, states.index(quantity), delay)
-        for entry, (quantity, delay) in enumerate(window.quantities)
-        if delay and window.names[entry] in read and quantity in states
-    ]

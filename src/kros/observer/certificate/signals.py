@@ -22,7 +22,7 @@ import numpy as np
 from ...core.arrays import Array, Flags, Parameters, Whole, frozen
 from ...core.rounding import AGREED, TINY
 from ...data import EpisodeBatch
-from ...loops.filtering import recursion
+from ...loops.library import recursion
 from ..data import ObserverData
 from ..residual import one_step_residual
 from ..screen import screened

@@ -1,4 +1,10 @@
-"""A batch of simulated Harmonic Drive motor drives (section IV-A): settings in, recordings and truth out."""
+"""A batch of simulated Harmonic Drive motor drives (section IV-A): settings in, recordings and truth out.
+
+Smoothed trapezoidal velocity profiles through pseudorandom checkpoints.
+
+The resulting velocity resembles a smoothed pseudorandom binary sequence (section IV-A): full speed forward or
+backward almost all the time.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +14,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
+from ...core.arrays import AnyArray, Array, Flags, frozen
 from ...core.errors import ConfigError, DataError
 from ...core.settings import member
 from ...data import prepare
 from ...data.population import Channel, EpisodeKey, Role
 from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
-from ..batch import OUTLIER_STREAM, BatchSettings, SimulatedEpisodes, SimulatedPopulation, by_unit
-from .dynamics import simulate
-from .parameters import (
+from ..batch import OUTLIER_STREAM, POSITION, VELOCITY, BatchSettings, SimulatedEpisodes, SimulatedPopulation, by_unit
+from .dynamics import (
     CURRENT_NOISE,
     GAINS,
     GEAR_RATIO,
@@ -29,13 +34,91 @@ from .parameters import (
     DriveParameters,
     Gains,
     Loop,
+    simulate,
 )
-from .reference import episode_reference
+
+REFERENCE_STREAM = 0  # first word of the spawn key
+MAX_SPEED = np.pi  # rad/s: 0.5 rev/s at the output
+ACCELERATION_SAMPLES = 150  # length of the ramps of the trapezoid
+JERK_SAMPLES = 60  # length of the ramps of the acceleration
+SETTLE_SAMPLES = 20  # shortest rest before the first move
+SECONDS_PER_CHECKPOINT = 2.0
+LEAST_IN_MOTION = 0.75  # share of the episode
+LEAST_HOLD_SAMPLES = 350  # at full speed, at least once in each direction
+REVOLUTION = 2 * np.pi
+_RAMPS = ACCELERATION_SAMPLES + JERK_SAMPLES  # length of a move at full speed: shorter ones would not reach it
+_CANDIDATES = 64
+_TRIES = 1000
+
+
+def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int, period_s: float) -> tuple[Array, Array]:
+    """Return target position and velocity of an episode, each of shape (n_rest + n_samples,), in rad and rad/s."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(REFERENCE_STREAM, episode)))
+    checkpoints = _draw_checkpoints(rng, n_samples, period_s)
+    durations = _durations(checkpoints, period_s)
+    spare = n_samples - SETTLE_SAMPLES - durations.sum()  # spread as rests at the checkpoints
+    rests = spare * rng.dirichlet(np.ones(len(durations) + 1))[:-1]
+    starts = SETTLE_SAMPLES + np.cumsum(rests) + np.concatenate([[0.0], np.cumsum(durations[:-1])]) + n_rest
+    return profile(checkpoints, starts, n_rest + n_samples, period_s)
+
+
+def profile(checkpoints: Array, starts: Array, n_samples: int, period_s: float) -> tuple[Array, Array]:
+    """Move from checkpoint to checkpoint, leaving each at a sample; position and velocity, (n_samples,), rad, rad/s."""
+    lengths = np.abs(np.diff(checkpoints)) / (MAX_SPEED * period_s)
+    knots = np.stack([starts, starts + lengths], axis=1).ravel()
+    ramp = np.interp(np.arange(-_RAMPS, n_samples + 1), knots, np.repeat(checkpoints, 2)[1:-1])
+    for length in (ACCELERATION_SAMPLES, JERK_SAMPLES):
+        total = np.cumsum(np.concatenate([np.zeros(length), ramp - ramp[0]]))  # before the start its value is held
+        ramp = ramp[0] + (total[length:] - total[:-length]) / length
+    position = ramp[_RAMPS:]
+    velocity = np.diff(ramp[_RAMPS - 1 :])
+    velocity = 0.5 * (velocity[:-1] + velocity[1:]) / period_s
+    return position[:-1].copy(), velocity
+
+
+def _durations(checkpoints: Array, period_s: float) -> Array:
+    """Samples that each move takes."""
+    return np.abs(np.diff(checkpoints, axis=-1)) / (MAX_SPEED * period_s) + _RAMPS
+
+
+def _draw_checkpoints(rng: np.random.Generator, n_samples: int, period_s: float) -> Array:
+    """Draw a start and checkpoints within one revolution in either direction that fit into the episode."""
+    seconds = n_samples * period_s
+    n_moves = max(2, round(seconds / SECONDS_PER_CHECKPOINT))
+    for _ in range(_TRIES):
+        drawn = _candidates(rng, n_moves, _RAMPS * MAX_SPEED * period_s)
+        good = _fits(drawn, n_samples, period_s)
+        if good.any():
+            return drawn[np.argmax(good)]
+    raise ConfigError(f"Drawing {n_moves} checkpoints for {seconds:g} s: none fit; ask for seconds >= 2.")
+
+
+def _candidates(rng: np.random.Generator, n_moves: int, shortest: float) -> Array:
+    """Draw sequences of checkpoints, neighbours at least `shortest` apart, shape (n_candidates, n_moves + 1)."""
+    drawn = np.empty((_CANDIDATES, n_moves + 1))
+    drawn[:, 0] = rng.uniform(-REVOLUTION, REVOLUTION, _CANDIDATES)
+    for j in range(n_moves):
+        here = drawn[:, j]
+        below = np.maximum(0.0, here - shortest + REVOLUTION)
+        above = np.maximum(0.0, REVOLUTION - here - shortest)
+        place = rng.uniform(0.0, below + above)
+        drawn[:, j + 1] = np.where(place < below, place - REVOLUTION, here + shortest + place - below)
+    return drawn
+
+
+def _fits(drawn: Array, n_samples: int, period_s: float) -> Flags:
+    """Tell which candidates fill the episode without overrunning it and hold full speed in both directions."""
+    total = _durations(drawn, period_s).sum(axis=1) + SETTLE_SAMPLES
+    moves = np.diff(drawn, axis=1) / (MAX_SPEED * period_s)
+    held = _RAMPS + LEAST_HOLD_SAMPLES
+    both = (moves.max(axis=1) >= held) & (moves.min(axis=1) <= -held)
+    return (total <= n_samples) & (total >= LEAST_IN_MOTION * n_samples) & both
+
 
 CONDITIONS = ("noload", "load")
 CHANNELS = (
-    Channel("position", Role.STATE, "rad", measured=True),
-    Channel("velocity", Role.STATE, "rad/s"),
+    POSITION,
+    VELOCITY,
     Channel("current", Role.STATE, "1"),
     Channel("target_position", Role.INPUT, "rad"),
     Channel("target_velocity", Role.INPUT, "rad/s"),
@@ -120,14 +203,17 @@ class HarmonicDrivePopulation(BatchSettings):
         samples, loop = (round(self.seconds / SAMPLE_PERIOD_S) + 1, REST_SAMPLES, SAMPLE_PERIOD_S), Loop(self.loop)
         inputs = [np.stack(episode_reference(self.seed, e, *samples)) for e in range(self.n_episodes)]
         position, velocity = np.stack(inputs, axis=1)
-        signals = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
-        self._disturb(signals.states, keys)
-        parts = {key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)}
+        states, true, torque = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
+        for i, key in enumerate(keys):  # what the recording adds: an offset of the position, noise on the current
+            rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
+            states[i, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
+            states[i, 2] += CURRENT_NOISE * rng.standard_normal(states.shape[-1])
+        parts = {key: (states[i], inputs[episode[i]], true[i]) for i, key in enumerate(keys)}
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
-        torque = signals.load_torque[:, REST_SAMPLES:-1]
-        truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, torque)
+        names, signals = tuple(u.id for u in units), torque[:, REST_SAMPLES:-1]
+        truth = Truth(names, parameters, loop, GAINS[loop], load_rows, signals)
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Any]:
@@ -136,10 +222,3 @@ class HarmonicDrivePopulation(BatchSettings):
             "ripple": RIPPLE * np.exp(self.spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))
         }
         return ripple | {"phase_rad": rng.uniform(0.0, 2 * np.pi, len(RIPPLE))}
-
-    def _disturb(self, states: AnyArray, keys: tuple[EpisodeKey, ...]) -> None:
-        """Add what the recording adds: an offset of the position in each episode, noise on the current."""
-        for row, key in enumerate(keys):
-            rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
-            states[row, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
-            states[row, 2] += CURRENT_NOISE * rng.standard_normal(states.shape[-1])

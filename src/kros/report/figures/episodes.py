@@ -15,8 +15,7 @@ from ...data import EpisodeBatch
 from ...data.population import Channel, EpisodeKey, Population, Role
 from ...evaluate import fit_percent
 from ...evaluate.errors import error_spectrum
-from ...evaluate.held_out import HeldOut
-from ...evaluate.sensor import as_shown
+from ...evaluate.held_out import HeldOut, as_shown
 from ...identify.identified import IdentifiedModels
 from ...observer import run_observer
 from ..canvas import Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin

@@ -17,9 +17,9 @@ from ...core.work import Executor
 from ...data import Population
 from ...data.recording import check_population
 from ...identify import ModelSet
+from ...identify.calibration import training_keys, unit_parameters
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
-from ...identify.unit_phases import training_keys, unit_parameters
 from ...observer import Observer
 from ...observer.screen import screened
 from ...observer.simulate import run_innovations

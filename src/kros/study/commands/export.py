@@ -11,7 +11,7 @@ from ...core.artifacts import write_json
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...data.discovery.roles import identifier
-from ...evaluate.sensor import as_arriving
+from ...evaluate.held_out import as_arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
 from ...identify.survey import RecordingFacts
 from ...loops.compiler import find_compiler

@@ -20,10 +20,10 @@ from ...core.rounding import AGREED
 from ...data import Population, read
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
-from ...evaluate.sensor import Arriving, arriving
+from ...evaluate.held_out import Arriving, arriving
 from ...identify import PhaseCalibration
+from ...identify.calibration import Texts, Values, unit_values
 from ...identify.survey import RecordingFacts
-from ...identify.unit_phases import Texts, Values, unit_values
 from ...observer import Observer
 from ...observer.screen import SampleStatus
 from ...observer.simulate import Course

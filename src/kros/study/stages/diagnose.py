@@ -19,13 +19,12 @@ import numpy as np
 
 from ...core.errors import KrosError
 from ...identify import Factor, ModelSet
-from ...identify.bootstrap import bootstrap_edmd, episode_weights
+from ...identify.edmd import bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
 from ...uncertainty import Form, UncertainModel, residual
-from ...uncertainty.noise import NoiseShare, noise_share
-from ...uncertainty.nominal import choose_nominal
+from ...uncertainty.bounded import choose_nominal
 from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
-from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from ...uncertainty.unit_residuals import NoiseShare, UnitResiduals, noise_share, unit_residuals
 from ...uncertainty.weights.cover import optimal_cover
 from ..engine.context import Context
 

@@ -11,7 +11,7 @@ from ...data import Population, read
 from ...data.population import OUTLIERS
 from ...data.prepare import parse_steps, prepare
 from ...design.synthesize import synthesize_all
-from ...evaluate.next_unit import draw_reserve
+from ...evaluate.over_units import draw_reserve
 from ...identify.calibration import calibrate
 from ...identify.identified import IdentifiedModels
 from ...identify.identify import with_models

@@ -24,9 +24,9 @@ from ...core.work import Progress
 from ...data.population import OUTLIERS, Population, split_episodes
 from ...design.task import is_robust
 from ...evaluate.held_out import HeldOut, Outcome
-from ...evaluate.next_unit import fewest_units, next_unit_bound
+from ...evaluate.over_units import fewest_units, next_unit_bound
+from ...identify.calibration import Values, unit_parameters
 from ...identify.identified import recordings_of, recordings_path
-from ...identify.unit_phases import Values, unit_parameters
 from ...observer import Observer
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps

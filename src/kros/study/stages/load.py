@@ -20,11 +20,10 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
-from ...evaluate.sensor import as_arriving
+from ...evaluate.held_out import as_arriving
 from ...lifting import Lifting
 from ...motor_drive import AngleLoad
-from ...motor_drive.observer import LoadSettings, load_observer
-from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
+from ...motor_drive.signals import LoadSettings, TorqueScale, known_load, load_accuracy, load_observer
 from ...observer import EstimatorSettings, Observer, run_observer
 from ..engine.context import Context
 

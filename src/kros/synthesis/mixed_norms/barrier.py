@@ -28,6 +28,7 @@ from dataclasses import replace
 from enum import Enum
 
 import numpy as np
+from numpy.linalg import LinAlgError, cholesky, eigvalsh, inv, solve
 
 from ...core.arrays import AnyArray, frozen
 from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
@@ -96,7 +97,7 @@ def _find_feasible(programme: _Programme, start: AnyArray, steps: int) -> Outcom
     for block in programme.blocks:
         unit = np.broadcast_to(np.eye(block.constant.shape[-1]), (1, *block.constant.shape))
         lifted.append(Block(block.constant, np.concatenate([block.basis, unit])))
-    worst = max(-float(np.linalg.eigvalsh(block.at(start)).min()) for block in programme.blocks)
+    worst = max(-float(eigvalsh(block.at(start)).min()) for block in programme.blocks)
     inside = np.clip(start, -0.9 * programme.box, 0.9 * programme.box)
     point = np.append(inside, 1.5 * max(worst, 0.0) + 1.0)
     extended = _Programme(goal, lifted, np.append(programme.box, 10 * point[n]))
@@ -116,7 +117,7 @@ def _follow(programme: _Programme, x: AnyArray, rtol: float, steps: int, stop_be
             gradient, hessian, roots = programme.derivatives(x)
             gradient = programme.c / mu + gradient
             direction = -_solve(hessian, gradient)
-        except np.linalg.LinAlgError:
+        except LinAlgError:
             break
         eigenvalues = programme.spectrum(roots, x, direction)
         decrement = float(np.sqrt(max(-float(gradient @ direction), 0.0)))
@@ -158,14 +159,14 @@ class _Programme:
     def holds(self, x: AnyArray) -> bool:
         """Whether a point satisfies all inequalities."""
         inside = bool((np.abs(x) < self.box).all())
-        return inside and all(np.linalg.eigvalsh(b.at(x)).min(initial=1.0) > 0 for b in self.blocks)
+        return inside and all(eigvalsh(b.at(x)).min(initial=1.0) > 0 for b in self.blocks)
 
     def derivatives(self, x: AnyArray) -> tuple[AnyArray, AnyArray, list[AnyArray]]:
         """Gradient ``-tr D_i``, Hessian ``tr D_i D_j`` with ``D_i = R M_i R'``, and the inverse Cholesky factors R."""
         above, below = 1 / (self.box - x), 1 / (self.box + x)
         gradient, hessian, roots = above - below, np.diag(above**2 + below**2), []
         for block in self.blocks:
-            root = np.linalg.inv(np.linalg.cholesky(block.at(x)))
+            root = inv(cholesky(block.at(x)))
             D = root @ block.basis @ root.swapaxes(-1, -2)
             gradient = gradient - np.trace(D, axis1=-2, axis2=-1).sum(axis=1)
             row, column = np.tril_indices(D.shape[-1])  # of symmetric matrices; entries below the diagonal count twice
@@ -179,7 +180,7 @@ class _Programme:
         parts = [direction / (self.box + x), -direction / (self.box - x)]
         for block, root in zip(self.blocks, roots, strict=True):
             change = root @ block.along(direction) @ root.swapaxes(-1, -2)
-            parts.append(np.linalg.eigvalsh((change + change.swapaxes(-1, -2)) / 2).ravel())
+            parts.append(eigvalsh((change + change.swapaxes(-1, -2)) / 2).ravel())
         return np.concatenate(parts)
 
 
@@ -188,8 +189,8 @@ def _solve(hessian: AnyArray, gradient: AnyArray) -> AnyArray:
     scale = 1 / np.sqrt(np.diag(hessian))
     scaled = hessian * scale[:, None] * scale + 100 * EPS * np.eye(len(hessian))
     right = gradient * scale
-    direction = np.linalg.solve(scaled, right)
-    direction += np.linalg.solve(scaled, right - scaled @ direction)
+    direction = solve(scaled, right)
+    direction += solve(scaled, right - scaled @ direction)
     return direction * scale
 
 

@@ -50,13 +50,12 @@ from ...core.arrays import AnyArray, ArrayLike, frozen
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
-from ...core.rounding import AGREED
+from ...core.rounding import AGREED, TINY
 from ...core.settings import member
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
-from ..generalized_plant import GeneralizedPlant
+from ..generalized_plant import GeneralizedPlant, interconnect
 from ..result import Injection
-from .interconnect import interconnect
 
 if TYPE_CHECKING:
     from ...identify.model_set import ModelSet
@@ -99,7 +98,7 @@ class ObserverProblem:
     remainder_right: StateSpace | None = None  # (m, m), right weight of it on scaled inputs
     injection: Injection = Injection.STATE  # where the correction enters
     process_noise: AnyArray | None = None  # (n,), standard deviation of white noise on every state per sample
-    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE  # of the uncertainty
+    form: Form = Form.INVERSE_INPUT_MULTIPLICATIVE  # of the uncertainty, or its name
 
     def __post_init__(self) -> None:
         put = partial(object.__setattr__, self)
@@ -110,15 +109,15 @@ class ObserverProblem:
         n, m, q, kept = self.nominal.n_states, self.nominal.n_inputs, len(self.C), self.n_original
         self._require(self.C.shape[1] == n, f"C should be (q, {n}) for {n} lifted states, found {self.C.shape}")
         self._require(kept is None or 1 <= kept <= n, f"n_original = {kept} should lie between 1 and {n}")
-        for name, size in (("input_scale", m), ("output_scale", n), ("noise", q)):
+        if self.process_noise is None:
+            put("process_noise", np.zeros(n))
+        positive = ("input_scale", m, TINY), ("output_scale", n, TINY), ("noise", q, TINY)
+        for name, size, least in (*positive, ("process_noise", n, 0.0)):
             value = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value > 0)))
-            self._require(valid, f"{name} should be {size} positive numbers, found {value}")
+            valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value >= least)))
+            wanted = f"{size} {'positive numbers' if least else 'numbers of at least zero'}"
+            self._require(valid, f"{name} should be {wanted}, found {value}")
             put(name, value)
-        level = np.zeros(n) if self.process_noise is None else np.asarray(self.process_noise, dtype=float)
-        valid = level.shape == (n,) and bool(np.all(np.isfinite(level) & (level >= 0)))
-        self._require(valid, f"process_noise should be {n} numbers of at least zero, found {level}")
-        put("process_noise", level)
         one = (self.remainder_left is None) != (self.remainder_right is None)
         self._require(self.injection is not Injection.NONE, "injection should be INPUT or STATE, found NONE")
         self._require(not one, "remainder_left and remainder_right come together, found only one of them")
@@ -131,7 +130,7 @@ class ObserverProblem:
     def _check_weights(self) -> None:
         """Refuse weights whose sizes or sampling periods do not fit; None is any size."""
         n, m, dt = self.nominal.n_states, self.nominal.n_inputs, self.nominal.dt
-        rows, columns = self.location.sizes(n, m)
+        rows, columns = self.form.sizes(n, m)
         sizes = (rows, None), (None, columns), (m, m), (n, None), (None, m)
         for name, (height, width) in zip(_WEIGHTS, sizes, strict=True):
             if getattr(self, name) is not None:
@@ -139,7 +138,7 @@ class ObserverProblem:
                 object.__setattr__(self, name, weight)
                 size = weight.n_outputs, weight.n_inputs
                 fits = size == (height or size[0], width or size[1]) and not weight.batch_shape
-                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {self.location.value}"
+                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {self.form.value}"
                 shape = f"{size[0]} x {size[1]}{weight.batch_shape or ''}"
                 self._require(fits, f"{wanted} uncertainty, found {shape}")
                 self._require(weight.dt == dt, f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s")
@@ -188,11 +187,6 @@ class ObserverProblem:
         return case
 
     @property
-    def location(self) -> Form:
-        """The form: where the perturbation acts and what it sees."""
-        return Form(self.form)
-
-    @property
     def input_weight(self) -> StateSpace:
         """W_u, the identity unless given."""
         return self.W_u if self.W_u is not None else gain(np.eye(self.nominal.n_inputs), self.nominal.dt)
@@ -220,14 +214,14 @@ class ObserverProblem:
     def M(self) -> StateSpace:  # noqa: N802
         """From the disturbance w1 to what Delta sees."""
         seen = self.input_weight
-        return self.W_R @ (seen if self.location.sees_input else self.scaled_model @ seen)
+        return self.W_R @ (seen if self.form.sees_input else self.scaled_model @ seen)
 
     @cached_property
-    def N(self) -> StateSpace | None:  # noqa: N802
-        """From what Delta does to what it sees; None for the forms without a loop."""
-        form, G = self.location, self.scaled_model
+    def N(self) -> StateSpace:  # noqa: N802
+        """From what Delta does to what it sees; zero for the forms without a loop."""
+        form, G = self.form, self.scaled_model
         if not form.inverse:
-            return None
+            return gain(np.zeros((self.W_R.n_outputs, self.W_L.n_inputs)), self.nominal.dt)
         return self.W_R @ (self.W_L if form.at_input is form.sees_input else G @ self.W_L)
 
     @property
@@ -261,11 +255,11 @@ class ObserverProblem:
             if isinstance(system, StateSpace) and not system.is_stable():
                 radius = f"{name} has spectral radius {float(system.spectral_radius()):.9g}"
                 raise SynthesisError(f"Observer synthesis: {radius}; it must be below 1, use a stable model.")
-        size = 0.0 if self.N is None else hinf_norm(self.N)
+        size = hinf_norm(self.N)
         if size >= 1:
             raise SynthesisError(
                 f"Observer synthesis: ||N|| = {size:.6g} should be below 1 for "
-                f"{self.location.value.replace('_', ' ')} uncertainty, otherwise the set contains ill-posed "
+                f"{self.form.value.replace('_', ' ')} uncertainty, otherwise the set contains ill-posed "
                 "plants; choose another form or nominal, or leave outliers out."
             )
         return size
@@ -313,7 +307,7 @@ class ObserverProblem:
     def scaled_estimate(self, estimate: StateSpace) -> StateSpace:
         """Turn an estimate of all states from measurements, states and inputs into scaled coordinates."""
         sizes = np.concatenate([self.noise, self.output_scale, self.input_scale])
-        return _scaled(estimate, 1 / self.output_scale, sizes)
+        return multiplied(estimate, 1 / self.output_scale, sizes)
 
     @property
     def _scales(self) -> tuple[AnyArray, AnyArray]:
@@ -323,14 +317,14 @@ class ObserverProblem:
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
         correction, noise = self._scales
-        return _scaled(controller, 1 / correction, noise)
+        return multiplied(controller, 1 / correction, noise)
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
         correction, noise = self._scales
-        return _scaled(controller, correction, 1 / noise)
+        return multiplied(controller, correction, 1 / noise)
 
 
-def _scaled(system: StateSpace, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
+def multiplied(system: StateSpace, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
     """Return a system with outputs and inputs multiplied."""
     return replace(system, B=system.B * inputs, C=outputs[:, None] * system.C, D=outputs[:, None] * system.D * inputs)

@@ -30,8 +30,7 @@ import numpy as np
 
 from ...core.arrays import AnyArray
 from ...core.lti import StateSpace, block_diagonal, gain
-from ..generalized_plant import GeneralizedPlant, split
-from .interconnect import interconnect
+from ..generalized_plant import GeneralizedPlant, interconnect, split
 from .observer_problem import ObserverProblem
 
 # In matrix inequalities: share of the measured channel's range, weight of the scaled correction.
@@ -40,7 +39,7 @@ _LEAST_NOISE, _PENALTY = 1e-3, 3e-2
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); brackets for remainder and process noise."""
-    location, plant, eye = problem.location, problem.error_plant(), np.eye
+    location, plant, eye = problem.form, problem.error_plant(), np.eye
     error, (n, _, n_u, n_z, q), m = plant.open_loop(), plant.sizes, problem.nominal.n_inputs
     d, r, noise, v, u = np.split(eye(error.n_inputs), np.cumsum([m, n, q, n]), axis=1)
     z, y = np.split(eye(error.n_outputs), [n_z])
@@ -71,7 +70,7 @@ def disturbed(problem: ObserverProblem, d: StateSpace, remainder: StateSpace | N
     """Return the disturbances at input and state: what the perturbation does, ``W_L w2``, and the remainder."""
     n, m, dt = problem.nominal.n_states, problem.nominal.n_inputs, problem.nominal.dt
     nothing = gain(np.zeros((n, 0)), dt) if remainder is None else remainder
-    if problem.location.at_input:
+    if problem.form.at_input:
         return d, nothing
     return gain(np.zeros((m, 0)), dt), gain(np.hstack([np.eye(n)] * 2), dt) @ block_diagonal([d, nothing])
 

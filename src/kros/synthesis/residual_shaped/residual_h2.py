@@ -10,12 +10,30 @@ A_f zeta + B_f w`` of the population's mean spectrum,
 the error of least variance is left by the Kalman predictor's gains ``L = [L_e; L_zeta]``, which is a correction through
 the state of the order of the filter: ``zeta_hat+ = A_f zeta_hat + L_zeta nu``, ``y^c = C_f zeta_hat + L_e nu``. For the
 mean spectrum it minimises the mean square error over the units.
+
+Shaping filters: stable models of low order whose output has a given spectrum.
+
+The signal omega passes a basis of delays and first-order lags, ``z+ = A_z z + B_z omega``, with covariance
+
+.. math:: G = \frac{1}{2\pi} \int Z S Z^H \, d\theta, \qquad Z = (e^{j\theta} I - A_z)^{-1} B_z
+
+and is predicted from it by least squares, ``omega = Theta z + Sigma^(1/2) w``: with delays alone this is the vector
+autoregression of Yule and Walker, and lags lengthen its memory without many states. The model is ``z+ = (A_z + B_z
+Theta) z + B_z Sigma^(1/2) w``. Because the prediction error is orthogonal to z, ``G = (A_z + B_z Theta) G (...)' + B_z
+Sigma B_z'`` holds exactly, on a grid of frequencies too, so the filter is *always stable* and reproduces G. Everything
+is linear in the spectrum until the least squares: spectra of units may be weighted.
+
+References
+----------
+C. I. Byrnes, T. T. Georgiou and A. Lindquist, "A new approach to spectral estimation: a tunable high-resolution
+spectral estimator", IEEE Transactions on Signal Processing 48 (2000) 3189-3205.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -23,11 +41,80 @@ from ...core.arrays import AnyArray, Array, Flags, frozen
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.norms import gramian, gramian_root, h2_norm
-from ...core.rounding import ROUNDING, TINY
+from ...core.rounding import ITERATED, ROUNDING, TINY
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.equations import balancing
-from ..riccati.kalman import kalman, predictor_bound
-from .shaping_filter import Basis, circle_weights, shaping_filter
+from ..riccati.h2 import balancing, kalman, predictor_bound
+
+_FLOOR = ROUNDING  # white noise of every channel, relative to the largest, which keeps the Gramian regular
+
+
+@frozen
+class Basis:
+    """Delays and first-order lags of every channel."""
+
+    delays: int = 8
+    # Of the lags, inside the unit circle, each one once: disturbances that last up to 300 samples
+    poles: tuple[float, ...] = (0.9, 0.97, 0.99, 0.997)
+
+    @cached_property
+    def scalar(self) -> tuple[AnyArray, AnyArray]:
+        """Dynamics and input of the basis of one channel."""
+        from scipy.linalg import block_diag
+
+        shift = np.eye(self.delays, k=-1)
+        poles = np.array(self.poles)
+        b = np.concatenate([np.eye(self.delays, 1)[:, 0], np.sqrt(1 - poles**2)])
+        return block_diag(shift, np.diag(poles))[-self.size :, -self.size :], b
+
+    @property
+    def size(self) -> int:
+        """States a channel."""
+        return self.delays + len(self.poles)
+
+    def response(self, z: AnyArray) -> AnyArray:
+        """Return Z of one channel at points of the unit circle, shape (f, size)."""
+        lags = np.sqrt(1 - np.array(self.poles) ** 2) / (z[:, None] - np.array(self.poles))
+        return np.hstack([z[:, None] ** -np.arange(1, self.delays + 1), lags])
+
+    def system(self, n: int) -> tuple[AnyArray, AnyArray]:
+        """Return A_z and B_z for n channels, the channels of one delay or lag side by side."""
+        A, b = self.scalar
+        return np.kron(A, np.eye(n)), np.kron(b[:, None], np.eye(n))
+
+
+def circle_weights(f: int) -> AnyArray:
+    """Return weights of the mean over the unit circle, for f equal steps from zero to Nyquist; they sum to one."""
+    weight = np.full(f, 1.0 / (f - 1))
+    weight[[0, -1]] /= 2
+    return weight
+
+
+def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
+    """Fit a shaping filter to a spectrum."""
+    f, n = spectrum.shape[:2]
+    weight = circle_weights(f)
+    R = np.tensordot(weight, spectrum, 1).real
+    largest = float(np.max(np.diag(R), initial=0.0))
+    if not (np.isfinite(R).all() and largest > 0):
+        raise SynthesisError("Shaping filter: the residual is zero or not finite; correct nothing (open loop).")
+    R = R + _FLOOR * largest * np.eye(n)
+    response = basis.response(np.exp(1j * np.linspace(0, np.pi, f)))
+    k = basis.size
+    blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
+    floor = np.einsum("f,fa,fb->ab", weight, response, response.conj()).real
+    G = blocks.reshape(k * n, k * n) + _FLOOR * largest * np.kron(floor, np.eye(n))
+    cross = np.einsum("f,fb,fij->ibj", weight, response.conj(), spectrum, optimize=True).real.reshape(n, k * n)
+    cross = cross + _FLOOR * largest * np.kron(weight @ response.conj().real, np.eye(n))
+    Theta = np.linalg.solve(G, cross.T).T if k else cross
+    innovation = R - Theta @ cross.T
+    values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)
+    if values.max() <= ITERATED * largest:
+        error = f"{np.sqrt(max(values.max(), 0) / largest):.1g} of its size"
+        problem = f"the residual can be predicted to {error}, it is constant or a few tones"
+        raise SynthesisError(f"Shaping filter: {problem}; record longer or richer episodes.")
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    A, B = basis.system(n)
+    return StateSpace(A + B @ Theta, B @ root, Theta, root, dt)
 
 
 @frozen
@@ -42,73 +129,20 @@ class ResidualProblem:
     dt: float  # s
     basis: Basis = field(default_factory=Basis)  # of the shaping filter
 
-    @property
-    def scaled(self) -> _Scaled:
-        """The problem in scaled coordinates."""
+    @cached_property
+    def plant(self) -> StateSpace:
+        """From the residual omega to the measurements, scaled; the states are the errors."""
         x, n = self.scale, len(self.A)
-        plant = StateSpace(self.A / x[:, None] * x, np.eye(n), self.C * x, np.zeros((len(self.C), n)), self.dt)
-        return _Scaled(plant, self.noise, self.spectra / np.outer(x, x), self.basis)
+        return StateSpace(self.A / x[:, None] * x, np.eye(n), self.C * x, np.zeros((len(self.C), n)), self.dt)
 
-
-def residual_h2(
-    problem: ResidualProblem,
-    tolerance_percent: float = 1.0,
-    n_lifted: int | None = None,
-    max_order: int | None = None,
-) -> Synthesis:
-    """Return the correction that is optimal for residuals; reducing its order costs each hidden state the tolerance."""
-    start = time.perf_counter()
-    shaped = problem.scaled
-    full = shaped.filter()
-    K = shaped.correction(full)
-    if not np.isfinite(shaped.norm(full, K)):
-        raise SynthesisError(
-            "Residual-shaped observer: its error is not bounded; check the model and what is measured."
-        )
-    K = shaped.reduced(full, K, tolerance_percent, full.n_states if max_order is None else max_order)
-    norm = shaped.norm(full, K)
-    note = f"mean of {len(shaped.spectra)} units, {problem.basis.delays} delays, lags {problem.basis.poles}"
-    note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
-    lower, gap, notes = enclosed(norm, shaped.lower_bound(full))
-    n = len(problem.A)
-    to_lifted = np.vstack([np.diag(problem.scale), np.zeros(((n_lifted or n) - n, n))])
-    return Synthesis(
-        method="residual_h2",
-        controller=gain(to_lifted, problem.dt) @ K,
-        status=Status.OPTIMAL if K.n_states == full.n_states else Status.CERTIFIED,
-        injection=Injection.STATE,
-        h2_norm=norm,
-        lower_bound=lower,
-        gap_percent=gap,
-        spectral_radius=shaped.error_system(K).largest_pole(),
-        solve_s=time.perf_counter() - start,
-        solver="riccati",
-        notes=(note, *notes),
-    )
-
-
-def promised_errors(problem: ResidualProblem) -> Array:
-    """Return the RMS error of every state, a share of its largest value, on the spectra as measured."""
-    shaped = problem.scaled
-    try:
-        K = shaped.correction(shaped.filter())
-    except SynthesisError:
-        return np.full(len(problem.A), np.inf)
-    return np.sqrt(shaped.unit_errors(K).mean(axis=0))
-
-
-@frozen
-class _Scaled:
-    """The problem in scaled coordinates."""
-
-    plant: StateSpace  # from the residual omega to the measurements, whose states are the errors
-    noise: Array
-    spectra: AnyArray
-    basis: Basis
+    @cached_property
+    def scaled_spectra(self) -> AnyArray:
+        """Spectra in scaled coordinates."""
+        return self.spectra / np.outer(self.scale, self.scale)
 
     def filter(self) -> StateSpace:
         """Shaping filter of the units' mean spectrum."""
-        return shaping_filter(self.spectra.mean(axis=0), self.basis, self.plant.dt)
+        return shaping_filter(self.scaled_spectra.mean(axis=0), self.basis, self.plant.dt)
 
     def lower_bound(self, shaping: StateSpace) -> float:
         """Root mean square of the scaled error that no correction falls below."""
@@ -156,7 +190,7 @@ class _Scaled:
         f, n = self.spectra.shape[1:3]
         response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / K.dt, f))
         weight, drive, rest = circle_weights(f), response[..., :n], response[..., n:]
-        driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real
+        driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.scaled_spectra, drive.conj(), optimize=True).real
         return driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2)
 
     def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, most: int) -> StateSpace:
@@ -181,3 +215,48 @@ class _Scaled:
             else:
                 low = k
         return K if K.n_states <= most else of_order(min(len(values), most))
+
+
+def residual_h2(
+    problem: ResidualProblem,
+    tolerance_percent: float = 1.0,
+    n_lifted: int | None = None,
+    max_order: int | None = None,
+) -> Synthesis:
+    """Return the correction that is optimal for residuals; reducing its order costs each hidden state the tolerance."""
+    start = time.perf_counter()
+    full = problem.filter()
+    K = problem.correction(full)
+    if not np.isfinite(problem.norm(full, K)):
+        raise SynthesisError(
+            "Residual-shaped observer: its error is not bounded; check the model and what is measured."
+        )
+    K = problem.reduced(full, K, tolerance_percent, full.n_states if max_order is None else max_order)
+    norm = problem.norm(full, K)
+    note = f"mean of {len(problem.spectra)} units, {problem.basis.delays} delays, lags {problem.basis.poles}"
+    note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
+    lower, gap, notes = enclosed(norm, problem.lower_bound(full))
+    n = len(problem.A)
+    to_lifted = np.vstack([np.diag(problem.scale), np.zeros(((n_lifted or n) - n, n))])
+    return Synthesis(
+        method="residual_h2",
+        controller=gain(to_lifted, problem.dt) @ K,
+        status=Status.OPTIMAL if K.n_states == full.n_states else Status.CERTIFIED,
+        injection=Injection.STATE,
+        h2_norm=norm,
+        lower_bound=lower,
+        gap_percent=gap,
+        spectral_radius=problem.error_system(K).largest_pole(),
+        solve_s=time.perf_counter() - start,
+        solver="riccati",
+        notes=(note, *notes),
+    )
+
+
+def promised_errors(problem: ResidualProblem) -> Array:
+    """Return the RMS error of every state, a share of its largest value, on the spectra as measured."""
+    try:
+        K = problem.correction(problem.filter())
+    except SynthesisError:
+        return np.full(len(problem.A), np.inf)
+    return np.sqrt(problem.unit_errors(K).mean(axis=0))

@@ -23,6 +23,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.linalg import LinAlgError, cond, eigh, eigvals, eigvalsh, norm, svd
 from scipy.linalg import schur
 
 from ...core.arrays import AnyArray, frozen
@@ -32,7 +33,7 @@ from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ...core.rounding import EPS, SINGULAR, TINY
 from ..generalized_plant import GeneralizedPlant, split
-from .equations import absorb_feedthrough, balancing, riccati_pair
+from .h2 import absorb_feedthrough, balancing, riccati_pair
 
 _DOUBT = float(np.sqrt(EPS))  # relative: conditions that hold or fail by less than this decide nothing
 
@@ -53,14 +54,16 @@ class Frame:
         """Scale, map and normalise a regular plant."""
         n, n_w, n_u, n_z, n_y = given.sizes
         scaled = scale(given)
-        p = _even(scaled)
+        X, Y = riccati_pair(scaled, "H-infinity synthesis, balancing")  # in coordinates that balance these
+        x = balancing(_root(Y, _size(scaled.A, scaled.B1)), _root(X, _size(scaled.A, scaled.C1)))[:2]
+        p = scaled.transformed(x=x)
         if given.dt > 0:
-            if n and np.linalg.cond(p.A + np.eye(n)) > SINGULAR:
+            if n and cond(p.A + np.eye(n)) > SINGULAR:
                 pole = "the plant has a pole at z = -1, which no bilinear map takes to continuous time"
                 raise SynthesisError(f"H-infinity synthesis: {pole}; move it into the stable region.")
             p = split(to_continuous(p.open_loop()), n_w, n_z)
-        U, s, Vh = np.linalg.svd(p.D12)
-        V, t, Wh = np.linalg.svd(p.D21)
+        U, s, Vh = svd(p.D12)
+        V, t, Wh = svd(p.D21)
         left, right = Vh.T / s, V.T / t[:, None]
         normal = replace(
             p.transformed(z=np.roll(U, -n_u, axis=1).T, w=np.roll(Wh, -n_y, axis=0).T, y=right, u=left),
@@ -76,11 +79,11 @@ class Frame:
         try:
             X, F = _half(p.A, p.B1, p.B2, p.C1, p.D11, p.D12, gamma)
             Y, L = _half(p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T, gamma)
-            radius = float(np.abs(np.linalg.eigvals(Y @ X)).max(initial=0.0)) / gamma**2
+            radius = float(np.abs(eigvals(Y @ X)).max(initial=0.0)) / gamma**2
             if min(_lowest(X, _size(p.A, p.C1)), _lowest(Y, _size(p.A, p.B1))) < -_DOUBT or radius > 1 + _DOUBT:
                 return None, True
             return (self._given(_central(p, gamma, X, F, Y, L.T)), False) if radius < 1 else (None, False)
-        except (np.linalg.LinAlgError, SynthesisError):
+        except (LinAlgError, SynthesisError):
             return None, False
 
     def _given(self, K: StateSpace) -> StateSpace:
@@ -100,7 +103,7 @@ def _half(
     solved = np.linalg.solve(R, np.hstack([D.T @ C, B.T]))
     closed, quadratic, cost = A - B @ solved[:, :n], B @ solved[:, n:], C.T @ C - C.T @ D @ solved[:, :n]
     # Units of the costate level the blocks: rounding is relative to both.
-    unit = np.sqrt(np.linalg.norm(cost) / np.linalg.norm(quadratic)) if cost.any() and quadratic.any() else 1.0
+    unit = np.sqrt(norm(cost) / norm(quadratic)) if cost.any() and quadratic.any() else 1.0
     H = np.block([[closed, -unit * (quadratic + quadratic.T) / 2], [-(cost + cost.T) / (2 * unit), -closed.T]])
     _, basis, stable = schur(H, output="real", sort="lhp")
     if stable != n:
@@ -111,7 +114,7 @@ def _half(
 
 def _lowest(X: AnyArray, size: float) -> float:
     """Lowest eigenvalue over the largest magnitude, which is at least a size."""
-    values = np.linalg.eigvalsh(X)
+    values = eigvalsh(X)
     return float(values.min(initial=0.0) / max(float(np.abs(values).max(initial=0.0)), size, TINY))
 
 
@@ -132,7 +135,7 @@ def _central(p: GeneralizedPlant, gamma: float, X: AnyArray, F: AnyArray, Y: Any
 def _to_discrete(K: StateSpace, dt: float) -> StateSpace:
     """Inverse of `to_continuous`, ``s = (z - 1) / (z + 1)``; a pole at s = 1 has a counterpart that is not causal."""
     eye, n = np.eye(K.n_states), K.n_states
-    if n and np.linalg.cond(eye - K.A) > SINGULAR:
+    if n and cond(eye - K.A) > SINGULAR:
         raise SynthesisError("H-infinity synthesis: the discrete controller of this level is not causal.")
     solved = np.linalg.solve(eye - K.A, np.hstack([eye + K.A, K.B]))
     output = np.linalg.solve((eye - K.A).T, K.C.T).T
@@ -142,27 +145,20 @@ def _to_discrete(K: StateSpace, dt: float) -> StateSpace:
 def scale(plant: GeneralizedPlant) -> GeneralizedPlant:
     """Return the plant for D22 = 0 with states scaled by powers of two that balance ``[[A, |B|], [|C|, 0]]``."""
     p = replace(plant, D22=np.zeros_like(plant.D22))
-    inputs = np.linalg.norm(np.hstack([p.B1, p.B2]), axis=1)[:, None]
-    outputs = np.linalg.norm(np.vstack([p.C1, p.C2]), axis=0)[None]
+    inputs = norm(np.hstack([p.B1, p.B2]), axis=1)[:, None]
+    outputs = norm(np.vstack([p.C1, p.C2]), axis=0)[None]
     sizes = balanced_size(np.block([[p.A, inputs], [outputs, np.zeros((1, 1))]]))
     size = sizes[:-1] / sizes[-1]
     return p.transformed(x=(np.diag(1 / size), np.diag(size)))
 
 
-def _even(p: GeneralizedPlant) -> GeneralizedPlant:
-    """Return the plant in coordinates that balance the Riccati solutions of its H2 problem."""
-    X, Y = riccati_pair(p, "H-infinity synthesis, balancing")
-    left, right, _ = balancing(_root(Y, _size(p.A, p.B1)), _root(X, _size(p.A, p.C1)))
-    return p.transformed(x=(left, right))
-
-
 def _root(M: AnyArray, size: float) -> AnyArray:
     """Factor L of ``M = L L'``, in which directions without weight have a small one; the identity for rounding."""
-    values, vectors = np.linalg.eigh(M)
+    values, vectors = eigh(M)
     largest = float(values.max(initial=0.0))
     return vectors * np.sqrt(np.maximum(values, _DOUBT * largest)) if largest > _DOUBT * size else np.eye(len(M))
 
 
 def _size(A: AnyArray, B: AnyArray) -> float:
     """Size of a Riccati solution to expect for dynamics A and inputs or outputs B."""
-    return float(np.linalg.norm(B)) ** 2 / max(float(np.linalg.norm(A)), TINY)
+    return float(norm(B)) ** 2 / max(float(norm(A)), TINY)

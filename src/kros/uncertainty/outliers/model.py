@@ -12,7 +12,7 @@ No single nominal decides; beside the excess stands its range over every unit as
 its criterion.
 
 Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold
-rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`tail`): an
+rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`score`): an
 extrapolation, and labelled as such. Units are taken out one at a time while they are beyond, up to a third of the
 units. Fewer than eight units decide nothing. All this compares estimates that are equally good: units that were
 recorded for too little are left open before (`population`). What a score would have shown stands beside it (`score`).
@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -34,8 +33,7 @@ from ...core.frequency import check_grid
 from ..forms import Form, as_form, check_responses, evenly
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
-from .score import Comparison, OutlierScore, Status
-from .tail import LEAST_SCORES, margins, separate
+from .score import LEAST_SCORES, Comparison, OutlierScore, Status, margins, separate
 
 
 @frozen
@@ -186,7 +184,13 @@ def score_outliers(
     >>> [score.unit for score in model.scores if score.outlier]
     ['20']
     """
-    G, ids, freqs = _population(responses, unit_ids, freqs_hz)
+    freqs = check_grid(freqs_hz, None)
+    G = check_responses(responses, unit_ids, freqs)
+    if len(G) < LEAST_SCORES:
+        raise DataError(f"Outlier scores: need at least {LEAST_SCORES} units, found {len(G)}.")
+    if freqs[0] == 0:
+        raise ConfigError("Outlier scores: need frequencies above zero.")
+    ids = unit_ids or tuple(map(str, range(len(G))))
     form, rate = as_form(form), float(false_alarm_rate)
     if not 0 < rate < 1:
         raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.01 is usual.")
@@ -201,16 +205,3 @@ def score_outliers(
     scores = comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist())))
     names = tuple(ids[k] for k in inliers)
     return OutlierModel(form, names, freqs, G[inliers], *scales, scores, parts.threshold_db, rate)
-
-
-def _population(
-    responses: Any, unit_ids: tuple[str, ...] | None, freqs_hz: Any
-) -> tuple[AnyArray, tuple[str, ...], AnyArray]:
-    """Checked responses, names and frequencies."""
-    freqs = check_grid(freqs_hz, None)
-    G = check_responses(responses, unit_ids, freqs)
-    if len(G) < LEAST_SCORES:
-        raise DataError(f"Outlier scores: need at least {LEAST_SCORES} units, found {len(G)}.")
-    if freqs[0] == 0:
-        raise ConfigError("Outlier scores: need frequencies above zero.")
-    return G, tuple(unit_ids or map(str, range(len(G)))), freqs

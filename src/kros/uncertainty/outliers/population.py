@@ -25,8 +25,7 @@ from ...identify.identified import EpisodeFactors, IdentifiedModels
 from ..forms import evenly
 from ..settings import OUTLIER, QuantifySettings
 from .model import OutlierModel, score_outliers
-from .score import OutlierScore, Status
-from .tail import LEAST_SCORES
+from .score import LEAST_SCORES, OutlierScore, Status
 
 log = logging.getLogger(__name__)
 

@@ -7,9 +7,9 @@ for the systems as returned (`proof`); at last the left weight is scaled until i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from ..forms import Form, completion, evenly, residual
 from ..settings import FIT, PROOF, SET
 from .cover import Cover, Weight, optimal_cover
 from .joint import JointProblem, fit_jointly, refit
-from .proof import Certificate, ResidualSystems, certify
+from .proof import Certificate, Descriptor, certify, invert, leaves_nothing, residual_system
 
 
 def fit_weight(
@@ -42,9 +42,13 @@ def fit_weight(
         weight = fit.again(missed)
         proof, ratio = fit.proven(weight)
     cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
-    weight, some = _lifted(weight, proof, float(ratio.max())), cover.left.min(axis=1) > 0
+    on_grid, left = float(ratio.max()), weight.left
+    lift = max(proof.bound, on_grid) * (1 + PROOF.rounding) or 1.0  # until the left weight touches from above
+    left = replace(left, C=left.C * lift, D=left.D * lift)
+    weight, some = replace(weight, left=left, method=proof.method), cover.left.min(axis=1) > 0
     excess = weight.magnitudes(freqs_hz).at(some).cost_db() - cover.at(some).cost_db()
-    return replace(weight, overbound_db_max=float(excess.max(initial=0.0))), cover
+    overbound = float(excess.max(initial=0.0))
+    return replace(weight, cover_max=on_grid / lift, overbound_db_max=overbound), cover
 
 
 def checking_grid(freqs_hz: AnyArray, sample_period_s: float) -> AnyArray:
@@ -74,8 +78,8 @@ class _Fit:
 
     def __init__(self, residuals: Residuals, freqs_hz: AnyArray, dt: float) -> None:
         self.residuals, self.dt, self.band = residuals, dt, freqs_hz[[0, -1]]
-        grid, realised = checking_grid(freqs_hz, dt), residuals.realised
-        modes = np.zeros(0) if realised is None else realised.modes_hz(grid)
+        grid = checking_grid(freqs_hz, dt)
+        modes = residuals.modes_hz(grid, dt)
         self.checked_hz = joined(grid, modes)
         self.freqs_hz = joined(freqs_hz, modes[self._inside(modes)])
         self.known = residuals.at(self.freqs_hz)
@@ -117,9 +121,9 @@ class _Fit:
         def ratio(freqs_hz: AnyArray) -> AnyArray:
             return self.residuals.ratio(weight.magnitudes(freqs_hz), freqs_hz)
 
-        E, realised = self.checked, self.residuals.realised
+        E = self.checked
         known = ratio(self.checked_hz) if E is None else weight.magnitudes(self.checked_hz).ratio(E)
-        pencils = realised.ratios(weight.left, weight.right) if realised and known.max() > 0 else []
+        pencils = self.residuals.ratios(weight.left, weight.right) if known.max() > 0 else []
         return certify(ratio, self.checked_hz, known, pencils, weight.left.dt), known.max(axis=0)
 
     def _weight(self) -> Weight:
@@ -140,13 +144,6 @@ class _Fit:
         return JointProblem.of(tau[some], optimal[some], E[leading[:, some], some]), cover.at(some)
 
 
-def _lifted(weight: Weight, proof: Certificate, on_grid: float) -> Weight:
-    """Scale the left weight until it touches the residuals from above."""
-    lift, left = max(proof.bound, on_grid) * (1 + PROOF.rounding) or 1.0, weight.left
-    left = replace(left, C=left.C * lift, D=left.D * lift)
-    return replace(weight, left=left, cover_max=on_grid / lift, method=proof.method)
-
-
 def _peaks(ratio: AnyArray) -> AnyArray:
     """Return the indices of the worst local maxima above one."""
     inner = np.concatenate([[-np.inf], ratio, [-np.inf]])
@@ -155,21 +152,39 @@ def _peaks(ratio: AnyArray) -> AnyArray:
 
 
 @frozen
+class Sampled:
+    """Responses at some frequencies, which are straight lines between them and constant beyond the ends."""
+
+    freqs_hz: AnyArray
+    values: AnyArray  # (..., frequency, p, m)
+
+    def __getitem__(self, rows: Any) -> Sampled:
+        """Return those of some units."""
+        return Sampled(self.freqs_hz, self.values[rows])
+
+    def frequency_response(self, freqs_hz: AnyArray) -> AnyArray:
+        """Return responses at other frequencies."""
+        from scipy.interpolate import make_interp_spline
+
+        ends = self.freqs_hz[[0, -1]]
+        return make_interp_spline(self.freqs_hz, self.values, k=1, axis=-3)(np.clip(freqs_hz, *ends))
+
+
+@frozen
 class Residuals:
     """Residuals of scaled units against a nominal, or remainders of the form, as functions of frequency, Hz."""
 
     form: Form
-    nominal: Callable[[AnyArray], AnyArray]  # response (frequency, p, m)
-    units: Callable[[AnyArray, slice], AnyArray]  # responses (unit, frequency, p, m) of some units
+    nominal: StateSpace | Sampled
+    units: StateSpace | Sampled
     count: int  # of units
-    systems: tuple[StateSpace, StateSpace] | None = None  # nominal and units, whose modes and pencils are looked at
     remainder: bool = False
 
     def pieces(self, freqs_hz: AnyArray) -> Iterator[tuple[AnyArray, AnyArray]]:
         """Yield responses and residuals, a few units at a time: memory does not grow with their number."""
-        G, step = self.nominal(freqs_hz), max(1, SET.at_once // max(1, len(freqs_hz)))
+        G, step = self.nominal.frequency_response(freqs_hz), max(1, SET.at_once // max(1, len(freqs_hz)))
         for start in range(0, self.count, step):
-            Gp = self.units(freqs_hz, slice(start, start + step))
+            Gp = self.units[start : start + step].frequency_response(freqs_hz)
             yield Gp, completion(self.form, G, Gp)[1] if self.remainder else residual(self.form, G, Gp)
 
     def at(self, freqs_hz: AnyArray) -> AnyArray:
@@ -180,7 +195,32 @@ class Residuals:
         """Return the ratios of all units to a cover at the same frequencies, shape (unit, frequency)."""
         return np.concatenate([cover.ratio(E) for _, E in self.pieces(freqs_hz)])
 
-    @cached_property
-    def realised(self) -> ResidualSystems | None:
-        """The systems behind these residuals."""
-        return None if self.systems is None else ResidualSystems(self.form, *self.systems, self.remainder)
+    def ratios(self, left: StateSpace, right: StateSpace) -> list[Descriptor]:
+        """Return `W_L^-1 E_k W_R^-1` of systems; none where pencils are large or nothing is left out."""
+        systems = self._systems(self.remainder)
+        if not systems or (self.remainder and leaves_nothing(self.form, *systems[0].D.shape)):
+            return []
+        before, after = (Descriptor.of(invert(w)) for w in (right, left))
+        parts = [after @ part @ before for part in systems]
+        return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= PROOF.rows else []
+
+    def modes_hz(self, grid_hz: AnyArray, dt: float) -> AnyArray:
+        """Return frequencies of modes of residuals and plants that a grid from DC to Nyquist passes over."""
+        parts = (*self._systems(remainder=False), *self._plants())
+        modes = np.concatenate([np.zeros(0, complex), *(part.poles() for part in parts)])
+        omega = modes.imag[modes.imag > 0]
+        half = np.abs(modes.real[modes.imag > 0])
+        at_hz, width_hz = np.arctan(omega) / (np.pi * dt), half / (1 + omega**2) / (np.pi * dt)
+        narrow = (width_hz < np.interp(at_hz, grid_hz, np.gradient(grid_hz))) & (at_hz <= grid_hz[-1])
+        around = omega[narrow] + half[narrow] * np.array([[-1.0], [0.0], [1.0]])
+        return np.unique(np.arctan(around[around > 0]) / (np.pi * dt)).clip(max=grid_hz[-1])
+
+    def _plants(self) -> list[Descriptor]:
+        """Return the nominal and the units where they are systems."""
+        plants = (self.nominal, *(self.units[k] for k in range(self.count)))
+        return [Descriptor.of(plant) for plant in plants if isinstance(plant, StateSpace)]
+
+    def _systems(self, remainder: bool) -> list[Descriptor]:
+        """Return the systems behind these residuals, or behind what the form leaves out."""
+        plants = self._plants()
+        return [residual_system(self.form, plants[0], Gp, remainder) for Gp in plants[1:]]

@@ -108,7 +108,15 @@ def fit_magnitude(
     True
     """
     freqs, dt, best = check_grid(freqs_hz, sample_period_s), sample_period_s, None
-    values = _check_magnitude(magnitude, freqs)
+    values = np.asarray(magnitude, float)
+    if values.shape != freqs.shape:
+        raise DimensionError(f"Magnitude fit: needs one at each of {len(freqs)} frequencies, found {values.shape}.")
+    valid = np.isfinite(values) & (values >= 0)
+    if not valid.all():
+        where = int(np.argmin(valid))
+        problem = "Magnitude fit: magnitudes should be finite and not negative"
+        raise DataError(f"{problem}, found {values[where]} at {freqs[where]} Hz; look at the responses.")
+    values = np.maximum(values, MAGNITUDE.floor * values.max())
     if max_order < 0:
         raise ConfigError(f"Magnitude fit: max_order should not be negative, found {max_order}.")
     if not values.any():
@@ -245,19 +253,6 @@ class _Grid:
         exact = dict.fromkeys(("primal_feasibility_tolerance", "dual_feasibility_tolerance"), 1e-10)
         solved = linprog(cost, table, zero, norm[None], [1.0], (None, None), "highs-ds", options=exact)
         return (solved.x[:size] * unit[:size], solved.x[size:-1] * unit[size:-1]) if solved.status == 0 else None
-
-
-def _check_magnitude(magnitude: ArrayLike, freqs: AnyArray) -> AnyArray:
-    """Return magnitudes with a relative floor."""
-    values = np.asarray(magnitude, float)
-    if values.shape != freqs.shape:
-        raise DimensionError(f"Magnitude fit: needs one at each of {len(freqs)} frequencies, found {values.shape}.")
-    valid = np.isfinite(values) & (values >= 0)
-    if not valid.all():
-        where = int(np.argmin(valid))
-        problem = "Magnitude fit: magnitudes should be finite and not negative"
-        raise DataError(f"{problem}, found {values[where]} at {freqs[where]} Hz; look at the responses.")
-    return np.maximum(values, MAGNITUDE.floor * values.max())
 
 
 _ROUNDING = 4096 * EPS

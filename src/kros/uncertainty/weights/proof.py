@@ -20,8 +20,8 @@ Systems & Control Letters 14 (1990) 287-293.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -212,44 +212,6 @@ def _eigenvalues(left: AnyArray, right: AnyArray) -> AnyArray:
     return values[np.isfinite(values)]
 
 
-@frozen
-class ResidualSystems:
-    """The discrete systems behind residuals, scaled as these are; units with the unit axis first."""
-
-    form: Form
-    nominal: StateSpace
-    units: StateSpace
-    remainder: bool = False  # what the form leaves out is bounded in place of the residual
-
-    def __iter__(self) -> Iterator[Descriptor]:
-        G = Descriptor.of(self.nominal)
-        for k in range(self.units.batch_shape[0]):
-            Gp = Descriptor.of(self.units[k])
-            E = residual_of(self.form, G, Gp, Descriptor.pseudo_inverse)
-            yield _remainder(self.form, G, Gp, E) if self.remainder else E
-
-    def ratios(self, left: StateSpace, right: StateSpace) -> list[Descriptor]:
-        """Return `W_L^-1 E_k W_R^-1` for every unit; none where pencils are large or nothing is left out."""
-        if self.remainder and leaves_nothing(self.form, self.nominal.n_outputs, self.nominal.n_inputs):
-            return []
-        before, after = (Descriptor.of(invert(w)) for w in (right, left))
-        parts = [after @ part @ before for part in self]
-        return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= PROOF.rows else []
-
-    def modes_hz(self, grid_hz: AnyArray) -> AnyArray:
-        """Return frequencies of modes of residuals and plants that a grid from DC to Nyquist passes over."""
-        dt = self.nominal.dt
-        plants = (self.nominal, *(self.units[k] for k in range(self.units.batch_shape[0])))
-        parts = (*replace(self, remainder=False), *map(Descriptor.of, plants))
-        modes = np.concatenate([part.poles() for part in parts]).astype(complex)
-        omega = modes.imag[modes.imag > 0]
-        half = np.abs(modes.real[modes.imag > 0])
-        at_hz, width_hz = np.arctan(omega) / (np.pi * dt), half / (1 + omega**2) / (np.pi * dt)
-        narrow = (width_hz < np.interp(at_hz, grid_hz, np.gradient(grid_hz))) & (at_hz <= grid_hz[-1])
-        around = omega[narrow] + half[narrow] * np.array([[-1.0], [0.0], [1.0]])
-        return np.unique(np.arctan(around[around > 0]) / (np.pi * dt)).clip(max=grid_hz[-1])
-
-
 def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
     """Tell whether a form rebuilds every regular unit of a shape exactly."""
     if form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
@@ -257,8 +219,11 @@ def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
     return n_outputs <= n_inputs if form.at_input else n_outputs >= n_inputs
 
 
-def _remainder(form: Form, G: Descriptor, Gp: Descriptor, E: Descriptor) -> Descriptor:
-    """Return the remainder of a form: the unit minus what `forms.rebuild` makes of the residual."""
+def residual_system(form: Form, G: Descriptor, Gp: Descriptor, remainder: bool) -> Descriptor:
+    """Return the residual, or the remainder of a form: the unit minus what `forms.rebuild` makes of the residual."""
+    E = residual_of(form, G, Gp, Descriptor.pseudo_inverse)
+    if not remainder:
+        return E
     if not form.inverse:
         return (Gp - G) - change_of(form, G, E)
     loop = loop_of(form, G, E)

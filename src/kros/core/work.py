@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from operator import call
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from .arrays import frozen
 from .artifacts import digest_of, divided, json_bytes, pack_arrays, united, unpack_arrays
 from .errors import DataError
 from .files import read_bytes, write_bytes
@@ -46,7 +47,7 @@ class Progress:
         """A stage is done, or was skipped."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Results:
     """Results in a folder, computed with the `source` of kros; `used` are those of the maps so far."""
 
@@ -74,7 +75,7 @@ def _read(path: Path | None, kind: Any) -> Any:
         return None
 
 
-@dataclass(frozen=True)
+@frozen
 class Storing:
     """A function of a path and a task, whose result is written where it has a path."""
 
@@ -101,7 +102,7 @@ def unpacked(content: bytes, path: Path, kind: Any) -> Any:
     return united(kind, json.loads(arrays["content"].tobytes()), arrays)
 
 
-@dataclass(frozen=True)
+@frozen
 class Work:
     """An executor, a progress listener and earlier results; by default work runs here, in silence, without results."""
 

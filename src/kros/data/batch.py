@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, Whole, frozen
+from ..core.arrays import Array, Flags, Names, Record, Whole, frozen
 from ..core.errors import DataError
 from .population import EpisodeKey, Population
 from .recording import some
@@ -92,7 +92,7 @@ class EpisodeBatch:
         return cls(keys, lengths, values[..., :n], inputs, population.sample_period_s, shared)
 
     @property
-    def units(self) -> tuple[str, ...]:
+    def units(self) -> Names:
         """The unit of every episode."""
         return tuple(k.unit for k in self.keys)
 
@@ -119,7 +119,7 @@ class EpisodeBatch:
         signals = self._signals(np.s_[:, rows])
         return replace(self, keys=keys, lengths=self.lengths[rows], parameters=parameters, **signals)
 
-    def _signals(self, part: Any) -> dict[str, Any]:
+    def _signals(self, part: Any) -> Record:
         """Return a part of every signal, by samples or by episodes."""
         signals = {name: getattr(self, name) for name in ("states", "inputs", "shown", "lost", "truths")}
         parts = {name: None if signal is None else signal[part] for name, signal in signals.items()}

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, ByName, Columns, Names, Record
 from ..core.errors import DataError
 from ..core.settings import member
 from .shown import Shown
@@ -89,7 +89,7 @@ class Unit:
 
     id: str
     group: str = ""
-    metadata: Mapping[str, Any] = field(default_factory=dict)
+    metadata: ByName = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def columns_in_order(channels: Iterable[Any]) -> tuple[Any, ...]:
     return tuple(sorted(channels, key=lambda c: list(Role).index(c.role)))
 
 
-def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
+def part_columns(columns: Iterable[Channel]) -> Record:
     """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
     columns = tuple(columns)
     truths = tuple(c for c in columns if c.role is Role.TRUTH)
@@ -195,7 +195,7 @@ class Population(Shown):
     units: tuple[Unit, ...]
     episodes: tuple[EpisodeKey, ...]
     source: Any  # kros.data.prepare.PreparedSource
-    metadata: Mapping[str, Any] = field(default_factory=dict)
+    metadata: ByName = field(default_factory=dict)
     truths: tuple[Channel, ...] = ()
     scaling: Mapping[str, Scaling] = field(default_factory=dict)
 
@@ -207,7 +207,7 @@ class Population(Shown):
         channels = f"states {states}; inputs {', '.join(self.inputs) or 'none'}{true}"
         return f"Population({sizes} every {self.sample_period_s:g} s; {channels})"
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         rows = {f"{role.value}s": ", ".join(c.label for c in self.columns if c.role is role) for role in Role}
         counts = {"units": len(self.unit_ids), "episodes": len(self.episodes)}
         return {**counts, "conditions": ", ".join(self.conditions), "period": f"{self.sample_period_s:g} s", **rows}
@@ -218,32 +218,32 @@ class Population(Shown):
         return self.channels + self.truths
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> Names:
         """Names of the states, in column order."""
         return tuple(c.name for c in self.channels if c.role is Role.STATE)
 
     @property
-    def inputs(self) -> tuple[str, ...]:
+    def inputs(self) -> Names:
         """Names of the inputs, in column order."""
         return tuple(c.name for c in self.channels if c.role is Role.INPUT)
 
     @property
-    def measured(self) -> tuple[str, ...]:
+    def measured(self) -> Names:
         """Names of the states that are available at run time."""
         return tuple(c.name for c in self.channels if c.role is Role.STATE and c.measured)
 
     @property
-    def true_states(self) -> tuple[int, ...]:
+    def true_states(self) -> Columns:
         """Columns of the states that the truths are the truths of, in the order of the truths."""
         return tuple(self.states.index(t.of) for t in self.truths)
 
     @property
-    def unit_ids(self) -> tuple[str, ...]:
+    def unit_ids(self) -> Names:
         """Identifiers of the units, in order."""
         return tuple(u.id for u in self.units)
 
     @cached_property
-    def conditions(self) -> tuple[str, ...]:
+    def conditions(self) -> Names:
         """Conditions, in natural order."""
         return tuple(sorted({condition for _, condition in self._positions}, key=natural_key))
 

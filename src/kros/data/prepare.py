@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ValidationError
 
-from ..core.arrays import Array, frozen
+from ..core.arrays import Array, ByName, Record, frozen
 from ..core.artifacts import digest_of, united
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened, stamp_of
@@ -92,7 +92,7 @@ def assemble(
     channels: tuple[Channel, ...],
     units: Iterable[Unit] = (),
     sample_period_s: float | None = None,
-    metadata: Mapping[str, Any] | None = None,
+    metadata: ByName | None = None,
     *,
     steps: Iterable[Step] = (),
     scaling: Scalings | None = None,
@@ -109,7 +109,7 @@ def assemble(
         sample_period_s = estimate_period(next(recordings.blocks(episodes[0], HEAD)))
     period = check_period(sample_period_s, "Population")
     source = PreparedSource(recordings, channels, period, episodes[0])
-    about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
+    about: Record = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
     population = Population(sample_period_s=period, units=known, episodes=episodes, source=source, **about)
     return prepare(population, steps)
 
@@ -152,17 +152,17 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     for step in added:
         signals = step.describe(signals)
     check_structure(signals.channels, population.episodes)
-    about: dict[str, Any] = {"scaling": signals.scaling, **part_columns(signals.channels)}
+    about: Record = {"scaling": signals.scaling, **part_columns(signals.channels)}
     source = replace(population.source, steps=population.source.steps + added)
     return replace(population, sample_period_s=signals.period_s, source=source, **about)
 
 
-def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.prepare") -> tuple[Step, ...]:
+def parse_steps(tables: Iterable[Step | ByName], where: str = "data.prepare") -> tuple[Step, ...]:
     """Return steps from TOML tables such as ``{"step": "trim", "start": 1000}``; steps pass through."""
     return tuple(t if isinstance(t, Step) else _parse_step(t, f"{where}[{i}]") for i, t in enumerate(tables))
 
 
-def _parse_step(table: Mapping[str, Any], where: str) -> Step:
+def _parse_step(table: ByName, where: str) -> Step:
     """Return the step of one table."""
     name = table.get("step") if isinstance(table, Mapping) else None
     if not isinstance(name, str) or name not in STEPS:

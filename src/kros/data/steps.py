@@ -30,7 +30,7 @@ import numpy as np
 from pydantic import ConfigDict
 
 from ..core import limits
-from ..core.arrays import Array
+from ..core.arrays import Array, Names
 from ..core.errors import ConfigError, DataError
 from ..core.files import did_you_mean
 from ..core.removed import refusing
@@ -79,7 +79,7 @@ class Step:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     @property
-    def named(self) -> tuple[str, ...]:
+    def named(self) -> Names:
         """Channels that this step needs."""
         names = getattr(self, "channels", None) or (getattr(self, "channel", None), getattr(self, "reference", None))
         return tuple(name for name in names if name is not None)
@@ -118,7 +118,7 @@ class Step:
 class Scale(Step):
     """Multiply channels by a factor and add an offset; `unit` names the new unit of measure."""
 
-    channels: tuple[str, ...]
+    channels: Names
     factor: float
     unit: str | None = None
     offset: float = 0.0
@@ -153,7 +153,7 @@ class Shift(Step):
     The value recorded at sample ``k + lag`` is moved to sample ``k``; the ends that have no partner are cut.
     """
 
-    channels: tuple[str, ...]
+    channels: Names
     lag: int
     step: ClassVar[str] = "shift"
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from ..core.arrays import Array, Parameters, frozen
+from ..core.arrays import Array, Columns, Parameters, Record, frozen
 from ..core.errors import ConfigError, DataError, SynthesisError
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
@@ -58,9 +58,9 @@ class Baseline:
     """A baseline that was tuned or trained."""
 
     by_unit: Mapping[str, Estimator]
-    measured: tuple[int, ...]
-    estimated: tuple[int, ...]
-    facts: dict[str, Any]
+    measured: Columns
+    estimated: Columns
+    facts: Record
     seen: Seen | None = None
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Mapping[str, Array]) -> Array:
@@ -105,7 +105,7 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
     return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
 
 
-def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
+def make_difference(training: TrainingSet, measured: Columns) -> Baseline:
     """Choose the cut-off of the filtered difference and find its scale."""
     population, batch = training.population, training.read()
     y, period = batch.measurements(measured), population.sample_period_s
@@ -123,7 +123,7 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
     return Baseline({"": best}, measured, estimated, facts, seen=training.seen)
 
 
-def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
+def make_learned(training: TrainingSet, measured: Columns) -> Baseline:
     """Train the learned estimator on whole training episodes of all units, once for every unit without it."""
     samples = len(training.population.read(training.keys[0])) * len(training.keys)
     step = max(1, samples // Ridge().rows)
@@ -133,7 +133,7 @@ def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)
 
 
-def make_trained(training: TrainingSet, measured: tuple[int, ...], kind: Regressor) -> Baseline:
+def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> Baseline:
     """Train a regression of scikit-learn on whole training episodes of all units, and without each fold of them."""
     lengths = [len(batch.states) for batch in training.one_by_one()]
     rows = Rows.of(training.one_by_one(), measured, lengths)
@@ -149,7 +149,7 @@ class MeanProfile:
     """Mean states of motions that are known by their inputs, for machines that repeat a motion."""
 
     n_states: int
-    estimated: tuple[int, ...]
+    estimated: Columns
     inputs: Sequence[Array]  # (n_samples, m)
     states: Sequence[Array]  # (n_samples, h)
 
@@ -181,7 +181,7 @@ def difference(u: Array, motion: Array, sizes: Array) -> float:
 
 def make_mean_profile(
     training: TrainingSet,
-    measured: tuple[int, ...],
+    measured: Columns,
     population: Population,
     keys: Iterable[EpisodeKey],
 ) -> Baseline:

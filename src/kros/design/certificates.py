@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
+from ..core.arrays import Array, Record, frozen
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
 from ..core.rounding import TINY
@@ -115,11 +114,9 @@ def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Part
     return observer.guard, replace(filter_certificate(observer, scales), scales=recorded), bound
 
 
-def _facts(
-    certificate: ReliftCertificate, bound: SignalBound, observer: Observer, errors: Sequence[float]
-) -> dict[str, Any]:
+def _facts(certificate: ReliftCertificate, bound: SignalBound, observer: Observer, errors: Sequence[float]) -> Record:
     """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
-    facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
+    facts: Record = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
     facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
     facts |= bound.facts(observer.measured) | {"assumptions": certificate.assumptions}
     recorded = bound.cover * factors(observer, {})[0][: len(bound.states)]
@@ -216,11 +213,11 @@ def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) ->
         return None, str(error)
 
 
-def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> dict[str, Any]:
+def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> Record:
     """Return what holds for an observer on every member of the set."""
     observer = design.observer
     order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
-    facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
+    facts: Record = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
     if design.facts.get("rows_fitted_to_single_steps"):
         reason = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
         return facts | {"reason": reason}

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
+from ..core.arrays import Array, ByName, Names, Record, frozen
 from ..core.artifacts import plain
 from ..core.errors import ConfigError, SynthesisError
 from ..core.settings import require_kind
@@ -58,10 +58,10 @@ class Designs:
     designs: Mapping[str, Design]
     deployed: str
     failed: Mapping[str, str]  # reasons
-    order: tuple[str, ...]
+    order: Names
 
     @property
-    def facts(self) -> dict[str, dict[str, Any]]:
+    def facts(self) -> dict[str, Record]:
         """What the metrics say of every observer, designed or not."""
         failed = {name: {"status": "failed", "reason": reason} for name, reason in self.failed.items()}
         return {name: failed.get(name) or dict(self.designs[name].facts) for name in self.order}
@@ -71,9 +71,9 @@ def synthesize(
     uncertain: UncertainModels,
     method: str | Method | None = None,
     *,
-    observer: Mapping[str, Any] | None = None,
-    estimator: Mapping[str, Any] | None = None,
-    sensor: Mapping[str, Any] | None = None,
+    observer: ByName | None = None,
+    estimator: ByName | None = None,
+    sensor: ByName | None = None,
     work: Work | None = None,
     **settings: Any,
 ) -> Design:
@@ -263,7 +263,7 @@ def choose_deployed(designs: Sequence[Design]) -> str:
     return best
 
 
-def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dict[str, Any]:
+def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> Record:
     """Return the object ``about`` of an observer's file, in the recordings' units."""
     population, known, calibration = identified.population, identified.facts, identified.calibration
     observer, certificate, facts = design.observer, design.certificate, design.facts
@@ -271,7 +271,7 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dic
     proof = {name: getattr(certificate, name) for name in ("certified", "reason", "gain", "assumptions")}
     trained = {"units": len(set(known.pooled) & set(task.models.unit_ids)), "conditions": identified.conditions}
     channels = (*population.states, *population.inputs)
-    content: dict[str, Any] = {
+    content: Record = {
         "kros": version("kros"),
         "units_of_measure": {c.name: c.unit for c in population.channels if c.name in identified.sizes},
         "largest_in_training": identified.sizes,

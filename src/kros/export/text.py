@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
 
+from ..core.arrays import ByName
 from ..core.errors import ConfigError
 
 _ALLOWED = frozenset(" _-.,:;+()[]%/^=@°·²³")  # beside letters and digits of any script
@@ -63,9 +63,7 @@ def require_identifier(name: str, what: str = "name") -> str:
     return name
 
 
-def rendered(
-    package: str, files: Mapping[str, str], context: Mapping[str, Any], filters: Mapping[str, Any]
-) -> dict[str, str]:
+def rendered(package: str, files: Mapping[str, str], context: ByName, filters: ByName) -> dict[str, str]:
     """Return the text of every file, by its name and that of its template in a package."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike
+from ..core.arrays import AnyArray, Array, ArrayLike, Names
 from ..core.errors import DimensionError
 from .data import ObserverData
 from .monitor import Watch
@@ -85,7 +85,7 @@ class RunningObserver:
         self.reset(y)
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> Names:
         """Names of the estimated states, in order."""
         return self.observer.lifting.states
 

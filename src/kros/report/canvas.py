@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ..core.arrays import AnyArray, ArrayLike
+from ..core.arrays import AnyArray, ArrayLike, Record
 from .names import RAISED, minus
 from .theme import DRAWING
 
@@ -71,7 +71,7 @@ def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
 
 def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **options: Any) -> None:
     """Write a small text at a place in shares of the axes, moved by an offset in points."""
-    settings: dict[str, Any] = {"xycoords": "axes fraction", "size": "small"} | options
+    settings: Record = {"xycoords": "axes fraction", "size": "small"} | options
     axes.annotate(text, at, xytext=offset, textcoords="offset points", **settings)
 
 

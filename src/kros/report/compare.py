@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from ..core.arrays import ByName, Record
 from .content import Column, Section, build
 from .facts import Facts
 from .names import number
 from .verdict import judge
 
-Settings = Mapping[str, Any]
-Rows = dict[str, Any]  # values by what they are of
+Rows = Record  # values by what they are of
 _WORDS = ("settings", "data", "deployed")  # topics whose values are texts
 TITLES = {
     "settings": "Settings that differ",
@@ -23,13 +23,13 @@ TITLES = {
 }
 
 
-def comparison(runs: Mapping[str, tuple[Settings, Facts]]) -> dict[str, dict[str, list[Any]]]:
+def comparison(runs: Mapping[str, tuple[ByName, Facts]]) -> dict[str, dict[str, list[Any]]]:
     """Return what is compared: by topic, and by name a value of every run, None where a run has none.
 
     Parameters
     ----------
     runs : mapping of str to (mapping, Facts)
-        Settings and metrics of every run.
+        ByName and metrics of every run.
     """
     settings, facts = [dict(flat(study)) for study, _ in runs.values()], [of for _, of in runs.values()]
     compared = {name: values for name, values in side_by_side(settings).items() if len(set(values)) > 1}
@@ -62,7 +62,7 @@ def change(first: Any, last: Any) -> str | None:
     return f"{'+' if last >= first else ''}{number(100 * (last / first - 1))} %"
 
 
-def flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+def flat(content: ByName, before: str = "") -> Iterator[tuple[str, str]]:
     """Yield all settings by dotted names, as text."""
     for name, value in content.items():
         if isinstance(value, Mapping):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from ..core.arrays import ByName, Record
 from ..core.files import write_bytes
 from .content import Section
 from .facts import Facts
@@ -28,7 +29,7 @@ Encoded = dict[str, str]
 Mapped = Callable[[Callable[[str], Encoded], Iterable[str]], Iterator[Encoded]]
 
 
-def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Path | None = None) -> Path:
+def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = None) -> Path:
     """Write the report of a run from ``metrics.json``, of which any part but ``study`` may be absent.
 
     `mapped` maps the drawing of a figure over their names, in order, for example in several processes.
@@ -38,7 +39,7 @@ def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Pat
     return path
 
 
-def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> str:
+def page(run: RunFolder, metrics: ByName, mapped: Mapped = map) -> str:
     """Return the report as HTML."""
     from markupsafe import Markup
 
@@ -67,7 +68,7 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     script = Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8"))
-    look: dict[str, Any] = {
+    look: Record = {
         "style": Markup(stylesheet()),
         "script": script,
         "head": None,

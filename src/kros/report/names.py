@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from math import floor, isfinite, log10
 from typing import TypeVar
 
+from ..core.arrays import frozen
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
 from ..design.baselines import BASELINES
 from ..design.methods import METHODS
@@ -18,7 +18,7 @@ LABELS = {method.name: method.label for method in METHODS} | BASELINES
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-@dataclass(frozen=True)
+@frozen
 class Look:
     """Colour and line style of a curve; `weight` multiplies its width."""
 

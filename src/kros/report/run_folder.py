@@ -6,15 +6,14 @@ Only files in the records of the run count. What a run does not have raises `Not
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import TypeVar
 from urllib.parse import unquote
 
 import numpy as np
 
-from ..core.arrays import AnyArray, frozen
+from ..core.arrays import AnyArray, Names, Record, frozen
 from ..core.artifacts import load_artifact, read_json
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
@@ -23,8 +22,6 @@ from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
 from .manifest import MANIFEST, recorded_files
 from .names import linear_first
-
-Record = dict[str, Any]  # content of an artifact
 
 T = TypeVar("T")
 
@@ -45,7 +42,7 @@ class Shown:
     models: Mapping[str, AnyArray]  # mapping of str to ndarray, shape (n_samples, n)
 
 
-@dataclass(frozen=True)
+@frozen
 class RunFolder:
     """A run that has ended, or a part of one."""
 
@@ -116,7 +113,7 @@ class RunFolder:
         return self._at_home("models/*/model.json", ModelSet.load, "no models have been identified yet")
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def kinds(self) -> Names:
         """Kinds of models that observers are designed for, the leading one first."""
         return tuple(self._record("models/models.json")["kinds"])
 

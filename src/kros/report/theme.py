@@ -7,12 +7,12 @@ Hues follow Okabe and Ito and stay apart for colour-blind readers; meaning is ne
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+
+from ..core.arrays import Record, frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Drawing:
     """How much is drawn; no number here changes a result."""
 
@@ -76,7 +76,7 @@ class Tone(Enum):
 
 HUES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)
 
-_SETTINGS: dict[str, Any] = {
+_SETTINGS: Record = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": "medium",

@@ -5,21 +5,18 @@ The head of the report and the lines behind ``kros run`` both come from here.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from enum import Enum
-from typing import Any
 
+from ..core.arrays import ByName, frozen
 from ..data.recording import some
 from ..design.task import split_name
 from .error_tables import ErrorCell, ErrorTable, tables_of
 from .facts import Facts
 from .names import condition_label, joined, label_of, number, observer_label, words
 
-Row = Mapping[str, Any]
 
-
-@dataclass(frozen=True)
+@frozen
 class Thresholds:
     """From where on a difference is a reason to check."""
 
@@ -40,7 +37,7 @@ class Status(Enum):
     NOT_READY = "NOT READY"
 
 
-@dataclass(frozen=True)
+@frozen
 class Reason:
     """Why a run is not READY, what to do about it, and the section of the report with the details."""
 
@@ -50,7 +47,7 @@ class Reason:
     section: str
 
 
-@dataclass(frozen=True)
+@frozen
 class Number:
     """A number that stands alone, with its unit of measure, what it is, and what puts it into proportion."""
 
@@ -60,7 +57,7 @@ class Number:
     notes: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
+@frozen
 class Verdict:
     """The head of the report."""
 
@@ -180,7 +177,7 @@ def _of_units(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
 
 
-def _inconclusive(rows: Sequence[Row], every: Sequence[Row]) -> str:
+def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
     """Say how many scores decide nothing."""
     if len(rows) == len(every):
         return f"No outlier score is conclusive ({len(rows)} of {len(every)})."
@@ -233,12 +230,12 @@ def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
 
 
-def undecided(rows: Sequence[Row]) -> list[Row]:
+def undecided(rows: Sequence[ByName]) -> list[ByName]:
     """Return the outlier scores that decide nothing."""
     return [r for r in rows if r.get("status") in ("not enough data", "cannot tell")]
 
 
-def units_text(rows: Sequence[Row]) -> str:
+def units_text(rows: Sequence[ByName]) -> str:
     """Return units with their conditions, for a sentence."""
     units: dict[str, list[str]] = {}
     for row in rows:

@@ -8,11 +8,12 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from ...core.arrays import Names, frozen
 from ...core.errors import DataError
 from ..measures import is_unit_row
 from ..readers.formats import is_binary, values_of
@@ -26,14 +27,14 @@ _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
 _NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
 
 
-@dataclass(frozen=True)
+@frozen
 class TableHead:
     """What the first lines of a file say."""
 
     dialect: Dialect
-    fields: tuple[str, ...]  # header; numbers of the columns as text where there is none
-    units: tuple[str, ...]  # cells of the row of units of measure, empty where there is none
-    rows: tuple[tuple[str, ...], ...]  # cells of the first rows of numbers
+    fields: Names  # header; numbers of the columns as text where there is none
+    units: Names  # cells of the row of units of measure, empty where there is none
+    rows: tuple[Names, ...]  # cells of the first rows of numbers
 
     def cells(self, column: int) -> list[str]:
         """Return the first cells of a column."""

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ...core.arrays import frozen
 from ...core.errors import DataError
 from ...core.work import Work
 from ..population import EpisodeKey, Population
 from ..recording import GroupWatch, NonFiniteError, check_episode, check_increasing, copies_among, digest_of
 
 
-@dataclass(frozen=True)
+@frozen
 class DiscoveryRule:
     """What recordings are judged by before a study exists."""
 
@@ -29,7 +30,7 @@ class DiscoveryRule:
 RULE = DiscoveryRule()
 
 
-@dataclass(frozen=True)
+@frozen
 class EpisodeLook:
     """What one episode looks like."""
 

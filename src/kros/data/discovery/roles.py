@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ..measures import KINDS, Measure, clean_unit, measure, split_header
 from ..recording import CHECK
 
@@ -51,7 +51,7 @@ class ColumnPart(str, Enum):
     LEFT_OUT = "left out"
 
 
-@dataclass(frozen=True)
+@frozen
 class TableColumn:
     """A column of the recordings."""
 

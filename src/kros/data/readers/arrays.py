@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
+from ...core.arrays import Array, ByName, frozen
 from ...core.errors import DataError
 from ...core.files import shortened
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
@@ -57,7 +57,7 @@ def from_arrays(
     inputs: Sequence[str] = (),
     measured: Sequence[str] = (),
     units: Iterable[Unit] = (),
-    metadata: Mapping[str, Any] | None = None,
+    metadata: ByName | None = None,
 ) -> Population:
     """Make a population from arrays.
 

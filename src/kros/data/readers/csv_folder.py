@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
-from ...core.arrays import Array, frozen
+from ...core.arrays import Array, ByName, Columns, Names, Record, frozen
 from ...core.errors import DataError
 from ...core.files import did_you_mean, read_toml
 from ...core.settings import Settings
@@ -94,8 +94,8 @@ class CsvMapping(Settings):
     threshold: float = Field(
         0.5, description="of the trigger, in the column's unit; the default is for a flag of 0 and 1"
     )
-    prepare: tuple[dict[str, Any] | Step, ...] = Field((), description="preparation steps of this mapping")
-    metadata: dict[str, Any] = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
+    prepare: tuple[Record | Step, ...] = Field((), description="preparation steps of this mapping")
+    metadata: Record = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
 
     @field_validator("files", "exclude")
     @classmethod
@@ -193,7 +193,7 @@ def _is_mark(text: str) -> bool:
     return len(text) == 1 and text.isascii() and not text.isalnum() and text not in '"+-\r\n\0'
 
 
-def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMapping:
+def load_mapping(mapping: CsvMapping | ByName | Path | str) -> CsvMapping:
     """Return a mapping from a TOML file or a table with the same keys."""
     if isinstance(mapping, CsvMapping):
         return mapping
@@ -202,7 +202,7 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
     return CsvMapping.of(read_toml(Path(mapping), "CSV mapping"), f"CSV mapping {mapping}")
 
 
-def mapping_schema() -> dict[str, Any]:
+def mapping_schema() -> Record:
     """Return the JSON schema of a mapping, with all preparation steps."""
     schema = CsvMapping.model_json_schema()
     steps = {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()}
@@ -222,8 +222,8 @@ class FilePlace:
     """Where an episode is: a file, its columns, the positions of those wanted (time first), rows, and which piece."""
 
     path: str
-    fields: tuple[str, ...]
-    wanted: tuple[int, ...]
+    fields: Names
+    wanted: Columns
     conversion: tuple[tuple[float, float], ...] = ()  # factor and offset of those wanted, where units differ
     rows: tuple[int, int] | None = None
     piece: tuple[int, int] = (0, 1)  # of how many
@@ -279,7 +279,7 @@ class CsvRecordings(Recordings):
 
 
 def read_csv_folder(
-    source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()
+    source: Path | str, mapping: CsvMapping | ByName | Path | str, optional: Collection[str] = ()
 ) -> Population:
     """Read a folder of CSV files, also gzip-compressed."""
     chosen, source = load_mapping(mapping), Path(source)

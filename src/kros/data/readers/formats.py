@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from ...core import limits
-from ...core.arrays import Array
+from ...core.arrays import Array, ByName, Record
 from ...core.errors import DataError, MissingDependencyError
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of
 from ..recording import some
 
-Group = tuple[Mapping[str, Any], Mapping[str, str]]
+Group = tuple[ByName, Mapping[str, str]]
 
 
 def _matlab(path: Path) -> Iterator[Group]:
@@ -38,7 +38,7 @@ def _hdf5(path: Path) -> Iterator[Group]:
     """HDF5; a unit of measure is the attribute `units` or `unit` of a data set."""
     import h5py
 
-    content, units = dict[str, Any](), dict[str, str]()
+    content, units = Record(), dict[str, str]()
 
     def visit(place: str, item: Any) -> None:
         name, unit = place.replace("/", "."), item.attrs.get("units", item.attrs.get("unit", ""))
@@ -82,7 +82,7 @@ def _bag(path: Path) -> Iterator[Group]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    rows: dict[str, list[dict[str, Any]]] = {}
+    rows: dict[str, list[Record]] = {}
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
         for connection, stamp, raw in reader.messages():
             numbers = {"time": 1e-9 * (stamp - reader.start_time)}

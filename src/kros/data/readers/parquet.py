@@ -21,7 +21,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
+from ...core.arrays import Array, Names, Record, frozen
 from ...core.artifacts import load_artifact, save_artifact, united
 from ...core.errors import DataError
 from ...core.files import draft_beside, pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
@@ -46,7 +46,7 @@ class ParquetRecordings(Recordings):
     """Reads one row group at a time; a place is a file, its row group and the number of samples."""
 
     folder: str
-    columns: tuple[str, ...]
+    columns: Names
 
     def file(self, place: Place) -> Path:
         """Return the file of a unit and condition."""
@@ -81,7 +81,7 @@ def _tables(path: Path, place: Place, columns: list[str], rows: int | None) -> I
     from pyarrow import parquet
 
     _, group, samples = place
-    options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
+    options: Record = {"pre_buffer": False, "page_checksum_verification": True}
     options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
     with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:
         actual, schema = file.metadata.row_group(group).num_rows, file.schema_arrow
@@ -161,9 +161,9 @@ class GroupRecord:
     unit: str
     condition: str
     file: str
-    episodes: tuple[str, ...]  # in the order of the row groups
+    episodes: Names  # in the order of the row groups
     samples: tuple[int, ...]  # length of each episode
-    digests: tuple[str, ...] = ()  # of all samples of each episode
+    digests: Names = ()  # of all samples of each episode
 
     @property
     def keys(self) -> list[EpisodeKey]:
@@ -178,7 +178,7 @@ class _Index:
     sample_period_s: float
     channels: tuple[Channel, ...]
     units: tuple[Unit, ...]
-    metadata: dict[str, Any]
+    metadata: Record
     groups: tuple[GroupRecord, ...]
     truths: tuple[Channel, ...] = ()
     scaling: dict[str, Scaling] = field(default_factory=dict)
@@ -227,7 +227,7 @@ def _write_episodes(population: Population, episodes: Episodes, path: Path) -> I
         raise DataError(f"Writing Parquet: {problem}; rename them.")
     kinds = dict.fromkeys(KEYS, pa.dictionary(pa.int32(), pa.string())) | {"k": pa.int64()}
     schema = pa.schema(kinds | dict.fromkeys(names, pa.float64()))
-    options: dict[str, Any] = {
+    options: Record = {
         "column_encoding": {"k": COUNTER, **dict.fromkeys(names, SIGNALS)},
         "compression": COMPRESSION,
         "use_dictionary": list(KEYS),

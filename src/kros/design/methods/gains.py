@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, frozen
 from ...core.errors import SynthesisError
 from ...core.lti import gain
 from ...observer.residual import (
@@ -30,7 +30,7 @@ from ..task import Design, DesignTask, Label, Method
 from ..validation import hidden_mean, percent_of
 
 
-@dataclass(frozen=True)
+@frozen
 class OpenLoop(Method):
     """The nominal model without correction."""
 
@@ -42,7 +42,7 @@ class OpenLoop(Method):
         return task.designed(task.open_loop())
 
 
-@dataclass(frozen=True)
+@frozen
 class KalmanTuned(Method):
     """The Kalman filter of a model fitted to single steps, whose process noise does best in training."""
 
@@ -86,7 +86,7 @@ def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:
     return replace(synthesis, controller=gain(np.vstack([K.D, np.zeros((n_lifted - len(K.D), K.n_inputs))]), K.dt))
 
 
-@dataclass(frozen=True)
+@frozen
 class ResidualH2(Method):
     """Kalman gains for the one-step residuals that a model leaves on the training episodes of all units."""
 

@@ -7,11 +7,11 @@ import json
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Bits
+from ...core.arrays import AnyArray, Array, Bits, ByName
 from ...core.errors import ConfigError, DimensionError
 from ...loops.compiler import COMPILERS, compile_library, find_compiler
 
@@ -128,7 +128,7 @@ class CompiledObserver:
         return machine
 
 
-def _wide(manifest: Mapping[str, Any]) -> str:
+def _wide(manifest: ByName) -> str:
     """Return the ending of the functions that take and give doubles."""
     return "_wide" if manifest["precision"] == "float" else ""
 

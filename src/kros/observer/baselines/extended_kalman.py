@@ -21,7 +21,7 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters, frozen
+from ...core.arrays import Array, Columns, Parameters, frozen
 from ...core.errors import DimensionError
 from ...lifting import Lifting
 
@@ -33,7 +33,7 @@ class ExtendedKalman:
     lifting: Lifting
     A: Array  # (n_lifted, n_lifted)
     B: Array  # (n_lifted, m), with input functions
-    measured: tuple[int, ...]
+    measured: Columns
     Q: Array  # (n, n), process noise of the original states; or (k, n, n) for k filters at once
     R: Array  # (q, q), measurement noise
     P0: Array  # (n, n), of the first estimate

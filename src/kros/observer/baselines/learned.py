@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters, Whole, frozen
+from ...core.arrays import Array, Columns, Names, Parameters, Whole, frozen
 from ...core.errors import DataError
 from ...core.rounding import TINY
 from ...data import EpisodeBatch
@@ -35,8 +35,8 @@ class Ridge:
 class Learned:
     """The trained estimator."""
 
-    measured: tuple[int, ...]
-    estimated: tuple[int, ...]
+    measured: Columns
+    estimated: Columns
     constant: Array  # (h,)
     weights: Array  # (delays, q + m, h): the latest sample first
 
@@ -58,9 +58,9 @@ class Moments:
     """Products of regressors and hidden states, summed over the episodes of every unit: a unit can be left out."""
 
     settings: Ridge
-    measured: tuple[int, ...]
-    estimated: tuple[int, ...]
-    units: tuple[str, ...]
+    measured: Columns
+    estimated: Columns
+    units: Names
     products: Array  # (unit, 1 + f + h, 1 + f + h)
 
     @classmethod
@@ -69,7 +69,7 @@ class Moments:
     ) -> Moments:
         """Collect every so many rows of training episodes."""
         settings, total = settings or Ridge(), dict[str, Array]()
-        estimated: tuple[int, ...] = ()
+        estimated: Columns = ()
         for batch in batches:
             estimated = tuple(i for i in range(batch.states.shape[-1]) if i not in measured)
             y = hold_missing(batch.measurements(measured))

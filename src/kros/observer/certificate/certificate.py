@@ -16,7 +16,7 @@ from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
+from ...core.arrays import Array, Names, frozen
 from ...core.artifacts import Storable
 from ...lifting.intervals import Box
 from ..data import ObserverData
@@ -93,7 +93,7 @@ class ReliftCertificate(Storable):
 
     KIND = "relift"
     scales: ReliftScales
-    assumptions: tuple[str, ...]
+    assumptions: Names
     box: Mapping[str, float | tuple[float, float] | Array]
     parameters: Mapping[str, float | tuple[float, float] | Array]
     status: ReliftStatus = ReliftStatus.UNBOUNDED
@@ -103,7 +103,7 @@ class ReliftCertificate(Storable):
     start: Array = field(default_factory=lambda: np.zeros((0, 0)))
     root: Array = field(default_factory=lambda: np.zeros((0, 0)))
     multipliers: Array = field(default_factory=lambda: np.zeros(0))
-    channels: tuple[str, ...] = ()
+    channels: Names = ()
 
     @property
     def certified(self) -> bool:
@@ -194,7 +194,7 @@ def relift_certificate(
     )
 
 
-def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None) -> tuple[str, ...]:
+def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None) -> Names:
     """Return what has to hold, in words."""
     found = ["the machine and the observer have the same inputs", "machine and observer lift with the same parameters"]
     if parameters:

@@ -27,7 +27,7 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike, frozen
+from ...core.arrays import Array, ArrayLike, Names, frozen
 from ...core.errors import DataError, DimensionError, KrosError
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ROUNDING
@@ -106,7 +106,7 @@ class ErrorSystem:
     D: Array  # (n_p, n_w)
     C: Array  # (n_z, n_xi)
     dt: float  # s
-    channels: tuple[str, ...] = ()  # what moves in every channel, for people
+    channels: Names = ()  # what moves in every channel, for people
     E: Array | float = 0.0  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
     start: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n_xi, n_window): where the first error goes
 

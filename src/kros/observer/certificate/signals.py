@@ -15,11 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Parameters, Whole, frozen
+from ...core.arrays import Array, Flags, Names, Parameters, Record, Whole, frozen
 from ...core.rounding import AGREED, TINY
 from ...data import EpisodeBatch
 from ...loops.filtering import recursion
@@ -36,13 +35,13 @@ from .proof import proven_gain
 class SignalBound:
     """Bounds on the errors of one observer at run time, in the units of measure of the batch."""
 
-    states: tuple[str, ...]  # of the recordings
-    units: tuple[str, ...]
+    states: Names  # of the recordings
+    units: Names
     bounds: Array  # (units, n), on RMS errors for what the recordings of a unit hold; infinite where there is none
     errors: Array  # (units, n), RMS errors as they were
     sizes: Array  # (n,), ranges of the states
     reason: str = ""  # why there is no bound
-    outside: tuple[str, ...] = ()  # units of which the observer refuses samples as implausible; their rows are infinite
+    outside: Names = ()  # units of which the observer refuses samples as implausible; their rows are infinite
 
     @property
     def cover(self) -> Array:
@@ -66,7 +65,7 @@ class SignalBound:
         values = 100 * self.cover / self.sizes
         return {name: float(v) if np.isfinite(v) else None for name, v in zip(self.states, values, strict=True)}
 
-    def facts(self, measured: Sequence[int] = ()) -> dict[str, Any]:
+    def facts(self, measured: Sequence[int] = ()) -> Record:
         """Return what goes into the metrics; ratios are those of hidden states, of all where none is."""
         if not self.certified:
             return {"set_certified": False, "set_reason": self.reason}

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, frozen
 from ...core.errors import ConfigError
 from ...data import EpisodeBatch
 from ...data.population import Channel, EpisodeKey, Population, Role
@@ -46,7 +45,7 @@ TRUTH = Look(Tone.INK.light, weight=2, opacity=DRAWING.shade)
 _PAPER = "The paper's observers: mixed H2-H∞ synthesis on models of EDMD. "
 
 
-@dataclass(frozen=True)
+@frozen
 class Signals:
     """What the signals of a figure are: channels, sampling period, samples of the enlarged part, gearbox band."""
 
@@ -63,7 +62,7 @@ class Signals:
         return cls(run.channels, run.sample_period_s, size, None if band is None else tuple(band))
 
 
-@dataclass(frozen=True)
+@frozen
 class Block:
     """One episode in a figure: its title, what is drawn beside the recorded signals, and of which states."""
 

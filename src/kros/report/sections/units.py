@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
+from ...core.arrays import ByName
 from ..content import Column, Section, build
 from ..facts import Facts
 from ..names import in_condition, number, words
 from ..theme import DRAWING
 
-Row = Mapping[str, Any]
 _SCORES = (
     "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. A "
     "unit above the threshold is flagged. A defect that changes every gain by less than the detectable change is not."
@@ -47,7 +46,7 @@ def units(facts: Facts) -> Section | None:
     return Section("units", "Units", [" ".join(text)], tables=[table], figure="outlier_scores" if rows else "")
 
 
-def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: set[str]) -> list[Row]:
+def _first(rows: Sequence[ByName], errors: Mapping[tuple[str, str], ByName], flagged: set[str]) -> list[ByName]:
     """Return flagged units, then those with the largest errors; of very many units the first ones."""
     largest: dict[str, float] = {}
     for (unit, _), row in errors.items():
@@ -57,7 +56,7 @@ def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: 
     return ordered[: DRAWING.units]
 
 
-def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], Row]) -> list[Column]:
+def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], ByName]) -> list[Column]:
     """Return the errors of every hidden channel."""
     keys = {"error (%)": "error_percent", "against the true signal (%)": "true_error_percent"}
     return [
@@ -67,7 +66,7 @@ def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], Row]) -> list
     ]
 
 
-def _scores(names: Sequence[str], scores: Mapping[tuple[str, str], Row]) -> list[Column]:
+def _scores(names: Sequence[str], scores: Mapping[tuple[str, str], ByName]) -> list[Column]:
     """Return scores and detectable changes in every condition."""
     keys = {"score (dB)": "score", "detectable change of gain (%)": "detectable"}
     return [
@@ -77,7 +76,7 @@ def _scores(names: Sequence[str], scores: Mapping[tuple[str, str], Row]) -> list
     ]
 
 
-def _status(row: Row, scores: Sequence[Row]) -> str:
+def _status(row: ByName, scores: Sequence[ByName]) -> str:
     """Return one word a unit."""
     if any(r["outlier"] for r in scores):
         return "flagged"
@@ -86,7 +85,7 @@ def _status(row: Row, scores: Sequence[Row]) -> str:
     return "undecided" if silent and status == "ok" else status
 
 
-def _flagged(row: Row) -> str:
+def _flagged(row: ByName) -> str:
     """Say where and how clearly a flagged unit differs."""
     text = f"Unit {row['unit']}{in_condition(row['condition'])}: score {number(row['score'])} dB"
     text += f", most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""

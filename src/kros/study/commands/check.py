@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from ...core.arrays import Array, Flags
+from ...core.arrays import Array, Flags, Record
 from ...core.artifacts import plain
 from ...core.errors import ConfigError, DataError
 from ...core.work import Executor
@@ -144,7 +143,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
         if monitor is not None and any(good.any() for _, good in judged):
             level = float(monitor.level(np.concatenate(monitor.in_turn(judged))).max())
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
-        row: dict[str, Any] = dict.fromkeys(("score", "threshold", "detectable"))
+        row: Record = dict.fromkeys(("score", "threshold", "detectable"))
         row |= {"unit": unit, "condition": condition, "outlier": outlier, "episodes": len(keys), "left_out": []}
         row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "missing": missing, "level_db": level}
         row |= {"level_rate": monitor and monitor.false_alarm_rate, "level_units": monitor and monitor.units}

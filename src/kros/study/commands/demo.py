@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from ...core.arrays import frozen
 from ...core.artifacts import digest_of, write_json
 from ...core.errors import ConfigError
 from ...core.work import Progress
@@ -21,7 +21,7 @@ from ..pipeline import RunResult, require_usable, run_in
 _STAGE, _RECORDINGS = "simulate", "simulated"
 
 
-@dataclass(frozen=True)
+@frozen
 class Simulation:
     """A population to simulate, and the format of its recordings."""
 

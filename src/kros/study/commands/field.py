@@ -6,13 +6,13 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from ...core.arrays import Array, Bits
+from ...core.arrays import Array, Bits, Names, frozen
 from ...core.artifacts import load_artifact
 from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import did_you_mean, read_toml
@@ -60,7 +60,7 @@ def open_data(config: StudyConfig, data: Path, optional: Collection[str]) -> Pop
         raise type(error)(f"{error} {other}") from error
 
 
-def hidden_states(observer: Observer) -> tuple[str, ...]:
+def hidden_states(observer: Observer) -> Names:
     """Return the recorded states that are not measured at run time."""
     return tuple(name for i, name in enumerate(observer.recorded) if i not in observer.measured)
 
@@ -132,7 +132,7 @@ def parse_given(texts: Collection[str], units: Collection[str], known: Collectio
     return given
 
 
-@dataclass(frozen=True)
+@frozen
 class FieldRecordings:
     """Recordings that need no hidden channels, with all that the observer needs to run on them."""
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
+from ...core.arrays import Names, Record, frozen
 from ...core.artifacts import digest_of, load_artifact, write_json
 from ...core.files import stamp_of
 from ...core.work import Results, Work
@@ -26,7 +26,7 @@ from ..config import Stage, StudyConfig
 from .store import METRICS, STUDY, Store, code_key
 
 
-@dataclass(frozen=True)
+@frozen
 class Context:
     """What a stage gets: the study, its run folder, where work runs, and recordings that are given as arrays."""
 
@@ -71,12 +71,12 @@ class Context:
         return UncertainModels.load_sets(self.store.folder, self.identified)
 
     @cached_property
-    def observers_record(self) -> dict[str, Any]:
+    def observers_record(self) -> Record:
         """What the synthesize stage left beside its observers: names, facts, and which is deployed."""
         return load_artifact(self.store.path("observers"), "observers")[0]
 
     @cached_property
-    def evaluation(self) -> dict[str, Any]:
+    def evaluation(self) -> Record:
         """What the evaluate stage left: errors of observers and baselines."""
         return load_artifact(self.store.path("evaluation"), "evaluation")[0]
 
@@ -84,13 +84,13 @@ class Context:
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@frozen
 class StageStep:
     """One stage: what it does, the sections or ``section.key`` it follows from, and which studies have it."""
 
     stage: Stage
     run: Callable[[Context], None]
-    sections: tuple[str, ...]
+    sections: Names
     wanted: Callable[[StudyConfig], bool] = lambda config: True
 
 

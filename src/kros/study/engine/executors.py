@@ -15,11 +15,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from threading import Lock
 from typing import Any, TypeVar
 
+from ...core.arrays import frozen
 from ...core.errors import ConfigError, KrosError, MissingDependencyError
 from ...core.work import Executor, Progress
 from .store import code_key
@@ -160,7 +160,7 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
 _CHUNKS = 100  # of a map of many tasks, which are small: handing each out costs the parent a tenth of the work
 
 
-@dataclass(frozen=True)
+@frozen
 class ProcessExecutor(Executor):
     """Runs tasks in worker processes, each with a single BLAS thread."""
 

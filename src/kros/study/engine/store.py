@@ -15,12 +15,12 @@ import logging
 import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
+from ...core.arrays import Record, frozen
 from ...core.artifacts import digest_of, file_digest, read_json, with_checksum, write_json
 from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy
@@ -35,7 +35,7 @@ STORE = "store"
 STUDY, METRICS = "study.json", "metrics.json"  # of a run, and of no stage
 
 
-@dataclass(frozen=True)
+@frozen
 class Store:
     """A run folder; `place` is the draft of the stage that runs, `shared` the store of the run around this one."""
 
@@ -82,7 +82,7 @@ class Store:
         name = "/".join(parts)
         return any(f == name or f.startswith(f"{name}/") for f in self.files())
 
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> Record:
         """Return the metrics of the run."""
         content = read_json(self.path(METRICS))
         if not isinstance(content, dict) or not {"study", "units"} <= set(content):
@@ -235,13 +235,13 @@ def require_own(out: Path, config: StudyConfig) -> bool:
     return False
 
 
-def _identity(study: dict[str, Any]) -> tuple[str, str]:
+def _identity(study: Record) -> tuple[str, str]:
     """Return a study's name and where its recordings are: what makes a changed study the same study still."""
     data = study.get("data")
     return str(study.get("name")), str(Path(str(data.get("source"))).resolve()) if isinstance(data, dict) else "nowhere"
 
 
-def _read_study(folder: Path) -> dict[str, Any]:
+def _read_study(folder: Path) -> Record:
     try:
         content = read_json(folder / STUDY)
     except DataError as error:

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array
+from ...core.arrays import AnyArray, Array, ByName, Names, Record
 from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
@@ -24,7 +24,7 @@ from ..engine.context import Context
 from .load import run_load
 
 log = logging.getLogger(__name__)
-Pieces = dict[tuple[str, ...], Callable[[], Any]]  # work by the names of its results
+Pieces = dict[Names, Callable[[], Any]]  # work by the names of its results
 
 
 def run(context: Context) -> None:
@@ -47,7 +47,7 @@ def run(context: Context) -> None:
     free_runs: dict[str, Outcome] = {name: results.pop(f"free run/{name}") for name in kinds}  # type: ignore[misc]
     estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
     band = band_hz(context)
-    content: dict[str, Any] = {
+    content: Record = {
         "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles, band)],
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
         "band_hz": band,
@@ -103,7 +103,7 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
 
 
-def facts_of(name: str, result: Outcome | str) -> Mapping[str, Any]:
+def facts_of(name: str, result: Outcome | str) -> ByName:
     """Return what the records say about a baseline that was made here."""
     if isinstance(result, Outcome):
         return result.facts

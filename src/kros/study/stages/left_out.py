@@ -14,10 +14,10 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
+from ...core.arrays import Record
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, IdentificationError, KrosError
 from ...core.work import Progress
@@ -32,8 +32,6 @@ from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
 from .evaluate import band_hz, estimation, facts_of, outcomes
 from .learning import FEWEST, LEARNING
-
-Record = dict[str, Any]  # of JSON
 
 log = logging.getLogger(__name__)
 FOLDER, KIND = Stage.LEFT_OUT.value, "left_out"

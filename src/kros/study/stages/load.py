@@ -11,11 +11,10 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, frozen
+from ...core.arrays import Array, Columns, Flags, Names, Record, frozen
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
@@ -27,8 +26,6 @@ from ...motor_drive.observer import LoadSettings, load_observer
 from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
 from ...observer import EstimatorSettings, Observer, run_observer
 from ..engine.context import Context
-
-Facts = dict[str, Any]  # of an estimate of the load
 
 log = logging.getLogger(__name__)
 LOAD = "load"
@@ -60,7 +57,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     names = [f"{kind}/{TRIAL.unaware}" for kind, _ in trial.liftings]
     makers |= {f"{n}/current": partial(_from_current, trial, observers[n]) for n in names if n in observers}
     curves: dict[str, Array] = {}
-    facts: dict[str, Facts] = {}
+    facts: dict[str, Record] = {}
     for name, make in makers.items():
         try:
             curves[name], fact = make()
@@ -77,7 +74,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     save_artifact(context.store.draft(LOAD), LOAD, content, single)
 
 
-def load_metrics(context: Context) -> Facts:
+def load_metrics(context: Context) -> Record:
     """Return what `metrics.json` says of the load; nothing where the study declares none."""
     if context.config.load.moment is None:
         return {}
@@ -85,7 +82,7 @@ def load_metrics(context: Context) -> Facts:
     return {"load_torque": {key: content[key] for key in ("known", "corner_hz", "settle_s", "observers", "rows")}}
 
 
-def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, Facts]:
+def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, Record]:
     """Return the load of an observer that has it as a state, with its level, and facts; save the observer."""
     (angle, current), test, inputs = trial.places, trial.test, context.population.inputs
     leveled = angle_load(context.config.estimator, trial.dt)
@@ -107,7 +104,7 @@ def angle_load(declared: EstimatorSettings, dt: float) -> AngleLoad:
     return AngleLoad(LoadSettings.level_s, dt, limit=max(map(abs, ends)))
 
 
-def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, Facts]:
+def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, Record]:
     """Return the paper's estimate: the error of the current, scaled where the load is known."""
     current, errors = trial.places[1], []
     for batch in (trial.train, trial.test):
@@ -124,8 +121,8 @@ class LoadTrial:
     """Recordings of a study with the load that is declared."""
 
     known: list[str]  # units
-    states: tuple[str, ...]
-    measured: tuple[int, ...]
+    states: Names
+    measured: Columns
     train: EpisodeBatch
     test: EpisodeBatch
     truth: tuple[Array, Array]  # of both, in units of current
@@ -164,7 +161,7 @@ class LoadTrial:
         """Which test episodes have the load."""
         return np.array([k.condition == TRIAL.condition for k in self.test.keys])
 
-    def row(self, name: str, estimate: Array) -> Facts:
+    def row(self, name: str, estimate: Array) -> Record:
         """Return errors of an estimate for the metrics."""
         skip = round(TRIAL.settle_s / self.dt)
         accuracy = load_accuracy(estimate, self.truth[1], self.dt, TRIAL.judged_hz, skip)

@@ -150,7 +150,7 @@ def hinf_norm(system: Any, tol: float = AGREED) -> float:
         raise KrosError(f"H-infinity norm: tol should be positive, found {tol}.")
     if not system.is_stable():
         return float("inf")
-    if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
+    if not (system.n_states and system.D.size):
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = balanced(to_continuous(system) if system.dt > 0 else system)
     known = first_frequencies(continuous.poles())

@@ -154,6 +154,12 @@ def units_axis(axes: Axes, units: Sequence[str]) -> None:
         axes.set_xlabel(f"{len(units)} units, in order")
 
 
+def set_titles(axes: Iterable[Axes], titles: Iterable[str]) -> None:
+    """Write the titles of a row of panels."""
+    for panel, title in zip(axes, titles, strict=False):
+        panel.set_title(title)
+
+
 def label_below(axes: Iterable[Axes], text: str = "frequency (Hz)") -> None:
     """Label the horizontal axes of a row."""
     for panel in axes:

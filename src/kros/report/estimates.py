@@ -20,9 +20,9 @@ def estimates_png(period_s: float, columns: Mapping[str, AnyArray], units: Mappi
             estimate, band = columns[f"{name}_hat"], columns[f"{name}_band"]
             time_s = period_s * np.arange(len(estimate))
             if name in columns:
-                look = {"color": Tone.INK.light, "lw": DRAWING.broad, "alpha": DRAWING.shade}
+                look = {"color": Tone.INK, "lw": DRAWING.broad, "alpha": DRAWING.shade}
                 panel.plot(*thin(time_s, columns[name]), label="recorded", **look)
-            panel.plot(*thin(time_s, estimate), color=Tone.BLUE.light, label="estimate")
+            panel.plot(*thin(time_s, estimate), color=Tone.BLUE, label="estimate")
             panel.fill_between(time_s, estimate - band, estimate + band, alpha=DRAWING.shade, lw=0, label="error band")
             panel.set_ylabel(f"{name} [{unit}]" if unit else name)
         panels[-1, 0].set_xlabel("time [s]")

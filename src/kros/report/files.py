@@ -70,7 +70,7 @@ def to_svg(figure: Figure, name: str) -> str:
     text = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', opening, text, count=1)
     text = _named_units(text)
     for tone in Tone:
-        text = text.replace(tone.light, f"var({tone.variable})")
+        text = text.replace(tone, f"var({tone.variable})")
     text = _FAMILY.sub(_FONTS, text)
     return _COORDINATES.sub(lambda match: _BEYOND.sub("", match.group()), text).strip()
 

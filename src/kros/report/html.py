@@ -89,7 +89,7 @@ def encoded(run: RunFolder, name: str) -> Encoded:
 
 def stylesheet() -> str:
     """Return the page's style with the tones of the figures as variables, for light and dark pages."""
-    light = "".join(f"{t.variable}:{t.light};" for t in Tone)
+    light = "".join(f"{t.variable}:{t};" for t in Tone)
     dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)
     text = (_TEMPLATES / "report.css").read_text(encoding="utf-8")
     return text.replace("/* light tones */", light).replace("/* dark tones */", dark)

@@ -58,13 +58,13 @@ def observer_label(name: str) -> str:
 
 def model_look(name: str) -> Look:
     """Return how a model's curves look: Koopman blue, linear orange."""
-    return Look((Tone.BLUE if is_koopman(name) else Tone.ORANGE).light)
+    return Look(Tone.BLUE if is_koopman(name) else Tone.ORANGE)
 
 
 def method_look(name: str) -> Look:
     """Return how an observer's curves look beside others of the same model: the hue of its method."""
     label = label_of(name)
-    return Look(Tone[label.tone].light, label.line)
+    return Look(Tone[label.tone], label.line)
 
 
 def observer_look(name: str) -> Look:

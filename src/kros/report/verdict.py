@@ -15,6 +15,8 @@ from .error_tables import ErrorCell, ErrorTable, tables_of
 from .facts import Facts
 from .names import condition_label, joined, label_of, number, observer_label, words
 
+Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the section with the details
+
 
 @frozen
 class Thresholds:
@@ -74,8 +76,7 @@ def judge(facts: Facts) -> Verdict:
     reasons = [Reason(Status.NOT_READY, *stop) for stop in _stopping(facts)]
     for checks in (_of_recordings, _of_units, _of_errors, _of_certificates):
         reasons += [Reason(Status.CHECK, *check) for check in checks(facts)]
-    known = [reason.status for reason in reasons]
-    status = next((s for s in (Status.NOT_READY, Status.CHECK) if s in known), Status.READY)
+    status = reasons[0].status if reasons else Status.READY
     certified = certificates(facts)
     void = voids(facts) if certified else []
     return Verdict(status, _sentence(facts, status, reasons), reasons, _numbers(facts), certified, void)
@@ -122,7 +123,7 @@ def _lag(lag_s: float | None) -> str:
     return f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
 
 
-def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _stopping(facts: Facts) -> Checks:
     """Yield what stops, what to do, and where the details are."""
     table, hidden = facts.table, facts.hidden
     if not facts.deployed:
@@ -142,7 +143,7 @@ def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield text, "Do not use it on new units.", "left-out"
 
 
-def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _of_recordings(facts: Facts) -> Checks:
     """Yield alerts of the recordings, confounded conditions, and too short recordings."""
     for alert in facts.study.get("alerts", ()):
         yield f"Recordings: {alert.rstrip('.')}.", "Look at the recordings.", "recordings"
@@ -160,7 +161,7 @@ def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield f"{text}not variation between units.", "Record longer, or more episodes.", "spread"
 
 
-def _of_units(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _of_units(facts: Facts) -> Checks:
     """Yield units that are flagged, undecided or have a remark."""
     rows = facts.get("outliers", [])
     if flagged := [r for r in rows if r["outlier"]]:
@@ -184,7 +185,7 @@ def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
     return f"{len(rows)} of {len(every)} outlier scores are not conclusive: {units_text(rows)}."
 
 
-def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _of_errors(facts: Facts) -> Checks:
     """Yield better observers, channels without improvement, and bounds that errors exceed."""
     table, hidden = facts.table, facts.hidden
     if table is None:
@@ -212,7 +213,7 @@ def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
             yield text, "Do not rely on this number; record more kinds of episodes.", "certificates"
 
 
-def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _of_certificates(facts: Facts) -> Checks:
     """Yield what is not certified or bounded, and folds that failed."""
     if facts.entry.get("relift_certified") is False:
         action = "Test it in parallel before anything depends on it."

@@ -44,12 +44,12 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
         ends = [score.lowest_db + shift, score.highest_db + shift]
-        axes.plot([place, place], ends, color=tone.light, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
-        (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone.light)
+        axes.plot([place, place], ends, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
+        (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone)
         name_units(point, [score.unit])
         if score.outlier or score is highest:
-            note(axes, score.unit, (place, score.score_db), (8, 0), xycoords="data", va="center", color=tone.light)
+            note(axes, score.unit, (place, score.score_db), (8, 0), xycoords="data", va="center", color=tone)
     if np.isfinite(model.threshold_db):
-        axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
+        axes.axhline(model.threshold_db, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
         text = f"threshold, {number(model.threshold_db)} dB"
         note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")

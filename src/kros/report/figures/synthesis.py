@@ -39,11 +39,11 @@ def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis]) -> li
     """Return responses with their label, colour and style."""
     models = run.models[name]
     freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
-    curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY.light, "-")]
+    curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY, "-")]
     if name in run.uncertain:
         weight = run.uncertain[name].weight
-        curves.append(("W left", weight.left.frequency_response(freqs), Tone.GOLD.light, "-"))
-        curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN.light, "--"))
+        curves.append(("W left", weight.left.frequency_response(freqs), Tone.GOLD, "-"))
+        curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN, "--"))
     for observer, synthesis in syntheses.items():
         response, look = scaled_filter(synthesis, models).frequency_response(freqs), method_look(observer)
         curves.append((f"K {label_of(observer).text}", response, look.colour, look.style))
@@ -57,7 +57,7 @@ def _panel(axes: Axes, curves: Sequence[Curve], models: ModelSet) -> None:
         size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
         if np.isfinite(size).any():
             axes.plot(freqs, size, line, color=colour, label=label)
-    axes.axhline(0, color=Tone.SOFT.light, lw=DRAWING.thin)
+    axes.axhline(0, color=Tone.SOFT, lw=DRAWING.thin)
     frequency_axis(axes, freqs)
 
 

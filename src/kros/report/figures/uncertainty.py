@@ -23,6 +23,7 @@ from ..canvas import (
     line_over_shade,
     lines_of_units,
     note,
+    set_titles,
 )
 from ..names import model_label, number, words
 from ..run_folder import RunFolder
@@ -53,7 +54,7 @@ def forms(run: RunFolder) -> tuple[Figure, str]:
     for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
         draw_forms(panel, model)
         for form, (freqs, bound) in published.get(name, {}).items():
-            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light)
+            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form])
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
     legend(figure, axes[0, 0], 3)
@@ -75,8 +76,8 @@ def draw_forms(axes: Axes, model: UncertainModel) -> None:
     for form, bound in model.bounds.items():
         width, label = DRAWING.broad if form is model.form else None, words(form.value)
         style = ":" if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else "-"  # it often hides output multiplicative
-        axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form].light, lw=width, label=label)
-    axes.axhline(0, color=Tone.SOFT.light, lw=DRAWING.thin)
+        axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form], lw=width, label=label)
+    axes.axhline(0, color=Tone.SOFT, lw=DRAWING.thin)
     frequency_axis(axes, model.freqs_hz)
 
 
@@ -97,8 +98,7 @@ def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResidu
         _draw_weights(row, model, models.inputs if model.form in _INPUT_SIDE else ())
         ratio_panel(row[2], residuals)
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
-    for panel, title in zip(axes[0], ("left weight", "right weight", "units relative to the weights"), strict=True):
-        panel.set_title(title)
+    set_titles(axes[0], ("left weight", "right weight", "units relative to the weights"))
     label_below(axes[-1])
     return figure
 
@@ -109,8 +109,7 @@ def uncertain_figure(model: UncertainModel) -> Figure:
     _draw_weights(axes[0], model)
     draw_forms(axes[0, 2], model)
     legend(figure, axes[0, 2], 3)
-    for panel, title in zip(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"), strict=True):
-        panel.set_title(title)
+    set_titles(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"))
     label_below(axes[0])
     return figure
 
@@ -136,8 +135,8 @@ def _side(axes: Axes, freqs_hz: AnyArray, magnitudes: AnyArray, cover: AnyArray,
     columns = range(magnitudes.shape[1])
     labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
     for i, tone in zip(columns, HUES, strict=False):
-        line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone.light)
-        note(axes, words(labels[i]), (0, 1), (4, -10 * i - 1), va="top", color=tone.light)
+        line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone)
+        note(axes, words(labels[i]), (0, 1), (4, -10 * i - 1), va="top", color=tone)
     frequency_axis(axes, freqs_hz, "")
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
     axes.set_ylim(low, high + (high - low) * len(columns) / 4)
@@ -148,11 +147,11 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     rows, freqs = differing(residuals), residuals.freqs_hz
     levels = decibel(residuals.ratio)[rows]
     names = [residuals.unit_ids[k] for k in rows]
-    lines_of_units(axes, freqs, levels, Tone.BLUE.light, "units", names)
+    lines_of_units(axes, freqs, levels, Tone.BLUE, "units", names)
     first = int(np.nanargmax(np.nanmax(np.where(np.isfinite(levels), levels, -np.inf), axis=1)))
-    axes.plot(freqs, levels[first], color=Tone.INK.light)
-    note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK.light)
-    axes.axhline(0, color=Tone.ALARM.light, lw=DRAWING.thin, ls="--")
+    axes.plot(freqs, levels[first], color=Tone.INK)
+    note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK)
+    axes.axhline(0, color=Tone.ALARM, lw=DRAWING.thin, ls="--")
     frequency_axis(axes, freqs, "")
 
 

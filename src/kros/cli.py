@@ -22,7 +22,7 @@ from typing import Annotated, Any, TextIO
 import typer
 from typer.core import TyperGroup
 
-from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
+from .core import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
 from .core.work import Progress
 
 FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128

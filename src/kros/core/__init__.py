@@ -8,6 +8,7 @@ Examples
 1.0
 """
 
+from .arrays import AnyArray, Array, ArrayLike, Bits, ByName, Columns, Flags, Names, Parameters, Record, Whole, frozen
 from .errors import (
     ConfigError,
     DataError,
@@ -20,6 +21,7 @@ from .errors import (
 from .lti import StateSpace, block_diagonal, gain
 from .norms import h2_norm, hinf_norm
 from .removed import refusing
+from .rounding import AGREED, EPS, ITERATED, ROUNDING, SINGULAR, TINY
 
 __all__ = [
     "ConfigError",

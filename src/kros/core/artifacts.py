@@ -187,8 +187,7 @@ class Storable:
     @loader
     def load(cls, folder: Path) -> Self:
         """Read what `save` wrote."""
-        value: Self = united(cls, *load_artifact(folder, cls.KIND))
-        return value
+        return united(cls, *load_artifact(folder, cls.KIND))
 
 
 def divided(value: Any) -> tuple[Any, dict[str, np.ndarray]]:

@@ -154,8 +154,7 @@ def hinf_norm(system: Any, tol: float = AGREED) -> float:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = balanced(to_continuous(system) if system.dt > 0 else system)
     known = first_frequencies(continuous.poles())
-    at, lower = _largest(system, known)
-    at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
+    at, lower = max(_largest(system, known), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower

@@ -13,7 +13,7 @@ Examples
 (('angle',), (50, 3))
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 from . import steps
 from .batch import EpisodeBatch
 from .population import Channel, EpisodeKey, Population, Role, Unit, split_episodes

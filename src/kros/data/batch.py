@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, Names, Record, Whole, frozen
-from ..core.errors import DataError
+from ..core import Array, DataError, Flags, Names, Record, Whole, frozen
 from .population import EpisodeKey, Population
 from .recording import some
 

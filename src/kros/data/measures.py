@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from ..core.rounding import AGREED
+from ..core import AGREED
 
 # SI units as kros writes them, with the kind of quantity
 _SI = """

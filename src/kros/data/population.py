@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ByName, Columns, Names, Record
-from ..core.errors import DataError
+from ..core import Array, ByName, Columns, DataError, Names, Record
 from ..core.settings import member
 from .shown import Shown
 

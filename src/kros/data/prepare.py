@@ -10,9 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ValidationError
 
-from ..core.arrays import Array, ByName, Record, frozen
+from ..core import Array, ByName, ConfigError, DataError, Record, frozen
 from ..core.artifacts import digest_of, united
-from ..core.errors import ConfigError, DataError
 from ..core.files import shortened, stamp_of
 from .population import Channel, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key, part_columns
 from .recording import (

@@ -17,11 +17,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import limits
+from ..core import AGREED, ROUNDING, DataError, limits
 from ..core.arrays import Array, Flags, Index, frozen
-from ..core.errors import DataError
 from ..core.files import shortened
-from ..core.rounding import AGREED, ROUNDING
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 

@@ -29,11 +29,8 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ConfigDict
 
-from ..core import limits
-from ..core.arrays import Array, Names
-from ..core.errors import ConfigError, DataError
+from ..core import Array, ConfigError, DataError, Names, limits, refusing
 from ..core.files import did_you_mean
-from ..core.removed import refusing
 from .population import Channel, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 

@@ -8,9 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ..core.arrays import Array, Columns, Parameters, Record, frozen
-from ..core.errors import ConfigError, DataError, SynthesisError
-from ..data.population import EpisodeKey, Population
+from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, SynthesisError, frozen
+from ..data import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
 from ..observer import Seen

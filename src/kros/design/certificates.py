@@ -8,15 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core.arrays import Array, Record, frozen
-from ..core.errors import SynthesisError
-from ..core.lti import StateSpace, gain
-from ..core.rounding import TINY
-from ..data import EpisodeBatch
-from ..data.population import EpisodeKey
+from ..core import TINY, Array, Record, StateSpace, SynthesisError, frozen, gain
+from ..data import EpisodeBatch, EpisodeKey
 from ..evaluate.errors import error_rms
 from ..identify import ModelSet
-from ..loops.filtering import recursion
+from ..loops import recursion
 from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, relift_certificate, run_observer
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound, linear_estimate

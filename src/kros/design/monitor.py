@@ -16,8 +16,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, frozen
-from ..core.rounding import EPS, ITERATED, ROUNDING
+from ..core import EPS, ITERATED, ROUNDING, Array, Flags, frozen
 from ..core.work import Work
 from ..observer import Observer
 from ..observer.estimator.regression import spread

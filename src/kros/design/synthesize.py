@@ -17,19 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ByName, Names, Record, frozen
+from ..core import Array, ByName, ConfigError, Names, Record, SynthesisError, frozen
 from ..core.artifacts import plain
-from ..core.errors import ConfigError, SynthesisError
 from ..core.settings import require_kind
 from ..core.work import Work
 from ..data.population import scaling_of
-from ..identify import ModelSet
-from ..identify.identified import IdentifiedModels
+from ..identify import IdentifiedModels, ModelSet
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor
 from ..observer.sensor import Sensors, require_measured
 from ..observer.units import in_sizes
-from ..uncertainty.quantify import UncertainModels
+from ..uncertainty import UncertainModels
 from .certificates import certificate, certify, usable_problem
 from .methods import METHODS, methods_of, preferred, suitable
 from .monitor import fit_monitor

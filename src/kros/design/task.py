@@ -10,10 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.arrays import Array, ByName, Names, Record, frozen
+from ..core import Array, ByName, Names, Record, SynthesisError, frozen, gain
 from ..core.artifacts import load_artifact, loader, save_artifact
-from ..core.errors import SynthesisError
-from ..core.lti import gain
 from ..data.shown import Shown
 from ..identify import ModelSet
 from ..observer import Observer, ReliftCertificate, Runtime

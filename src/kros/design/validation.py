@@ -8,16 +8,13 @@ from itertools import chain, zip_longest
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
-from ..core.rounding import TINY
-from ..data import EpisodeBatch
-from ..data.population import EpisodeKey, Population
+from ..core import TINY, Array, frozen
+from ..data import EpisodeBatch, EpisodeKey, Population
 from ..data.prepare import scale_population
 from ..evaluate.errors import error_rms, largest
 from ..evaluate.held_out import observers_run
 from ..evaluate.sensor import as_shown
-from ..identify import ModelSet
-from ..identify.identified import IdentifiedModels
+from ..identify import IdentifiedModels, ModelSet
 from ..observer import Observer, Seen
 from ..observer.estimator.regression import spread
 from ..observer.sensor import Sensors, in_units

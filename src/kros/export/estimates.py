@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.arrays import Array, Bits, Record
+from ..core import Array, Bits, Record
 from ..core.artifacts import write_json
-from ..data.population import EpisodeKey
-from ..observer.screen import SampleStatus
+from ..data import EpisodeKey
+from ..observer import SampleStatus
 
 Write = Callable[[EpisodeKey, int, Bits, Array], None]
 ENDINGS = (".parquet", ".csv")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 
-from ..core.arrays import ByName
-from ..core.errors import ConfigError
+from ..core import ByName, ConfigError
 
 _ALLOWED = frozenset(" _-.,:;+()[]%/^=@°·²³")  # beside letters and digits of any script
 _C_WORDS = re.compile(

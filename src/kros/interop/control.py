@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import DataError, DimensionError, MissingDependencyError
-from ..core.lti import StateSpace
+from ..core import DataError, DimensionError, MissingDependencyError, StateSpace
 
 try:
     import control

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
-from ..core.errors import DataError
+from ..core import Array, ArrayLike, DataError
 from ..data.population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role
 from ..data.readers.arrays import as_numbers, from_arrays
 

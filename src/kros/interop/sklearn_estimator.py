@@ -11,9 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core.arrays import Array, Whole
-from ..core.errors import ConfigError, DataError, IdentificationError, MissingDependencyError
-from ..core.rounding import ROUNDING
+from ..core import ROUNDING, Array, ConfigError, DataError, IdentificationError, MissingDependencyError, Whole
 from ..identify import edmd, free_run
 from ..identify.edmd import relative_pivots
 from ..identify.factors import triangular

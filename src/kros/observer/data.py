@@ -21,11 +21,21 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, ByName, Columns, Names, Parameters, Record, frozen
-from ..core.errors import ConfigError, DimensionError
+from ..core import (
+    ITERATED,
+    Array,
+    ArrayLike,
+    ByName,
+    Columns,
+    ConfigError,
+    DimensionError,
+    Names,
+    Parameters,
+    Record,
+    StateSpace,
+    frozen,
+)
 from ..core.linalg import balanced_size
-from ..core.lti import StateSpace
-from ..core.rounding import ITERATED
 from ..core.settings import member
 from ..lifting import Lifting
 from ..synthesis.result import Injection

@@ -14,11 +14,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, create_model
 
-from ..core.arrays import ByName, Record
+from ..core import ByName, DataError, KrosError, Record, StateSpace
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
-from ..core.errors import DataError, KrosError
 from ..core.files import shortened
-from ..core.lti import StateSpace
 from ..core.settings import Settings
 from ..lifting import Lifting
 from .data import ObserverData

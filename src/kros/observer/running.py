@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike, Names
-from ..core.errors import DimensionError
+from ..core import AnyArray, Array, ArrayLike, DimensionError, Names
 from .data import ObserverData
 from .monitor import Watch
 from .screen import LONGEST, Held, SampleStatus, Screen, Screened

@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ..core.arrays import AnyArray, ArrayLike, Record
+from ..core import AnyArray, ArrayLike, Record
 from .names import RAISED, minus
 from .theme import DRAWING
 

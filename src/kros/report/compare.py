@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ..core.arrays import ByName, Record
+from ..core import ByName, Record
 from .content import Column, Section, build
 from .facts import Facts
 from .names import number

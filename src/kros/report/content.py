@@ -10,7 +10,7 @@ from itertools import groupby
 from math import isfinite
 from typing import Any
 
-from ..core.arrays import frozen
+from ..core import frozen
 from .names import number
 
 Pairs = Sequence[tuple[str, Sequence[str]]]

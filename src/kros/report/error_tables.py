@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import ByName, Names, frozen
+from ..core import ByName, Names, frozen
 from ..data.population import natural_key
 
 Rows = Sequence[ByName]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..core.arrays import AnyArray
+from ..core import AnyArray
 from .canvas import grid, legend, thin
 from .files import to_png
 from .theme import DRAWING, Tone, style

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
-from ..core.arrays import ByName, Names, frozen
+from ..core import ByName, Names, frozen
 from ..design.task import split_name
 from .error_tables import ErrorTable, error_tables
 from .names import observer_label, readable_unit
@@ -25,8 +25,7 @@ class Facts:
     @property
     def study(self) -> ByName:
         """What the study is about."""
-        study: ByName = self.metrics["study"]
-        return study
+        return self.metrics["study"]
 
     @property
     def measured(self) -> Names:
@@ -36,8 +35,7 @@ class Facts:
     @property
     def observers(self) -> Mapping[str, ByName]:
         """What is known of every observer."""
-        observers: Mapping[str, ByName] = self.get("observers", {})
-        return observers
+        return self.get("observers", {})
 
     @property
     def deployed(self) -> str:

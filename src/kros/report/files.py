@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from ..core.errors import ConfigError
+from ..core import ConfigError
 from ..core.files import write_bytes
 from ..core.work import Progress
 from .canvas import Figure, settle

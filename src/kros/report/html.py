@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ..core.arrays import ByName, Record
+from ..core import ByName, Record
 from ..core.files import write_bytes
 from .content import Section
 from .facts import Facts

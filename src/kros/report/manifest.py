@@ -14,8 +14,8 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from pydantic import Field, NonNegativeFloat
 
+from ..core import ConfigError, DataError
 from ..core.artifacts import CHECKSUM, check_checksum, file_digest, read_json, with_checksum, write_json
-from ..core.errors import ConfigError, DataError
 from ..core.files import is_file, stamp_of
 from ..core.settings import Settings
 

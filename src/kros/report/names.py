@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
 from typing import TypeVar
 
-from ..core.arrays import frozen
+from ..core import frozen
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
 from ..design.baselines import BASELINES
 from ..design.methods import METHODS

@@ -6,7 +6,7 @@ from importlib import import_module
 from inspect import signature
 from typing import Any
 
-from ..core.errors import ConfigError
+from ..core import ConfigError
 from .canvas import Figure
 from .theme import style
 

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Names, Record, frozen
+from ..core import AnyArray, Names, Record, frozen
 from ..core.artifacts import load_artifact, read_json
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
@@ -62,8 +62,7 @@ class RunFolder:
     @cached_property
     def study(self) -> Record:
         """The study with all settings."""
-        content: Record = read_json(self.folder / "study.json")
-        return content
+        return read_json(self.folder / "study.json")
 
     @cached_property
     def facts(self) -> Record:

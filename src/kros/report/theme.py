@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from enum import StrEnum
 from typing import Self
 
-from ..core.arrays import Record, frozen
+from ..core import Record, frozen
 
 
 @frozen
@@ -116,5 +116,4 @@ def style() -> AbstractContextManager[None]:
     """Return a context in which new figures get this theme; settings of the caller come back afterwards."""
     import matplotlib
 
-    context: AbstractContextManager[None] = matplotlib.rc_context(_SETTINGS)  # type: ignore[arg-type]
-    return context
+    return matplotlib.rc_context(_SETTINGS)  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from enum import Enum
 
-from ..core.arrays import ByName, frozen
+from ..core import ByName, frozen
 from ..data.recording import some
 from ..design.task import split_name
 from .error_tables import ErrorCell, ErrorTable, tables_of

@@ -10,15 +10,13 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from ..core.arrays import Names, Record
-from ..core.errors import ConfigError
+from ..core import ConfigError, Names, Record
 from ..core.files import read_toml, shortened
 from ..core.settings import Settings
 from ..data.readers.csv_folder import mapping_schema
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
-from ..observer import EstimatorSettings
-from ..observer.sensor import Sensor
+from ..observer import EstimatorSettings, Sensor
 from ..uncertainty.settings import UncertaintySettings
 
 

@@ -5,7 +5,7 @@ What was not run is absent, what is unknown is null, nothing is invented.
 
 from __future__ import annotations
 
-from ..core.arrays import Record
+from ..core import Record
 from ..core.artifacts import load_artifact, plain
 from ..evaluate.intervals import interval_rows
 from ..observer import Observer
@@ -32,8 +32,7 @@ def collect_metrics(context: Context, until: Stage) -> Record:
             metrics |= _evaluation(context, metrics)
         elif stage in _OF_STAGES:
             metrics |= _OF_STAGES[stage](context)
-    clean: Record = plain(metrics)
-    return clean
+    return plain(metrics)
 
 
 def _study(context: Context, done: list[Stage]) -> Record:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.arrays import ByName, Record
+from ..core import ByName, ConfigError, Record
 from ..core.artifacts import write_json
-from ..core.errors import ConfigError
 from ..core.settings import member
 from ..core.work import Executor, Progress, Work
 from ..data import Population

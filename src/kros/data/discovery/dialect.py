@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.arrays import Names, frozen
-from ...core.errors import DataError
+from ...core import DataError, Names, frozen
 from ..measures import is_unit_row
 from ..readers.formats import is_binary, values_of
 from ..readers.tables import ABSENT, ORDERS, Dialect, cells_of, file_fields, head_of, lines_of, microseconds

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, Names, Record, frozen
-from ...core.errors import ConfigError, DataError
+from ...core import Array, ConfigError, DataError, Names, Record, frozen
 from ...core.files import did_you_mean
 from ...core.work import Work
 from ..measures import split_header

@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 from itertools import chain, groupby
 
-from ...core.arrays import Names, frozen
+from ...core import Names, frozen
 from ..population import OUTLIERS
 
 UNIT, CONDITION, EPISODE, GROUP = "unit", "condition", "episode", "group"

@@ -10,7 +10,7 @@ from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
+from ...core import Array, frozen
 from ..measures import KINDS, Measure, clean_unit, measure, split_header
 from ..recording import CHECK
 

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any
 
-from ...core.arrays import ByName, Record
+from ...core import ByName, Record
 from ..readers.csv_folder import CsvMapping
 from .discover import Discovery
 from .roles import ColumnPart, TableColumn

@@ -16,8 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
-from ...core.arrays import Array, ByName, Columns, Names, Record, frozen
-from ...core.errors import DataError
+from ...core import Array, ByName, Columns, DataError, Names, Record, frozen
 from ...core.files import did_you_mean, read_toml
 from ...core.settings import Settings
 from ..measures import clean_unit, measure, split_header

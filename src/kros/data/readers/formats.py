@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import limits
-from ...core.arrays import Array, ByName, Record
-from ...core.errors import DataError, MissingDependencyError
+from ...core import Array, ByName, DataError, MissingDependencyError, Record, limits
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of
 from ..recording import some
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.errors import DataError
+from ...core import DataError
 from ...core.files import whole_folder
 from ..population import OUTLIERS, Channel, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import ConfigError, DataError
+from ...core import ConfigError, DataError
 from ..population import Population
 from ..prepare import parse_steps
 from ..prepare import prepare as prepared

@@ -15,9 +15,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from ...core import limits
-from ...core.arrays import AnyArray, Array
-from ...core.errors import DataError
+from ...core import AnyArray, Array, DataError, limits
 from ...core.files import pass_on_shortage, require_regular, shortened
 from ..measures import clean_unit, is_unit_row, split_header
 from .formats import columns_of, is_binary, values_of

@@ -7,9 +7,8 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import frozen
-from ...observer import EstimatorSettings, Recordings, Seen, identify_estimator
-from ...observer.sensor import Sensor
+from ...core import frozen
+from ...observer import EstimatorSettings, Recordings, Seen, Sensor, identify_estimator
 from ...synthesis import Status, Synthesis
 from ..task import Design, DesignTask, Label, Method
 

@@ -11,9 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.errors import SynthesisError
-from ...core.lti import gain
+from ...core import Array, SynthesisError, frozen, gain
 from ...observer.residual import (
     like_measurement_noise,
     mean_error_dynamics,

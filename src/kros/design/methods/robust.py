@@ -10,9 +10,7 @@ from itertools import product
 import numpy as np
 
 from ... import synthesis  # solvers load when they are used
-from ...core.arrays import Record, frozen
-from ...core.errors import SynthesisError
-from ...core.lti import StateSpace, block_diagonal, gain
+from ...core import Record, StateSpace, SynthesisError, block_diagonal, frozen, gain
 from ...identify.model_set import EDMD
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...uncertainty import residual

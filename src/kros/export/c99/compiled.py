@@ -11,8 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Bits, ByName
-from ...core.errors import ConfigError, DimensionError
+from ...core import AnyArray, Array, Bits, ByName, ConfigError, DimensionError
 from ...loops.compiler import COMPILERS, compile_library, find_compiler
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, Record, frozen
-from ...core.errors import ConfigError
+from ...core import Array, ConfigError, Record, frozen
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer

@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.rounding import EPS, ITERATED, TINY
+from ...core import EPS, ITERATED, TINY, Array, frozen
 from ...lifting import Lifting
 from ...observer.data import ObserverData
 from .realise import RULE

@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.rounding import ROUNDING
+from ...core import ROUNDING, Array, frozen
 from ...observer import Observer
 from ...observer.units import in_coordinates
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ...core.arrays import AnyArray, Array, Record, frozen
+from ...core import AnyArray, Array, Record, frozen
 from ...core.artifacts import json_bytes, with_checksum
 from ...core.files import whole_folder, write_bytes
 from ...observer import Observer

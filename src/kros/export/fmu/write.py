@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import ConfigError
+from ...core import ConfigError
 from ...core.files import write_bytes
 from ...loops.compiler import compile_library, find_compiler
 from ...observer import Observer

@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters, frozen
+from ...core import Array, Parameters, frozen
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 

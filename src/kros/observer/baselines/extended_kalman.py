@@ -21,8 +21,7 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, Columns, Parameters, frozen
-from ...core.errors import DimensionError
+from ...core import Array, Columns, DimensionError, Parameters, frozen
 from ...lifting import Lifting
 
 

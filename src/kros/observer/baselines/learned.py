@@ -15,9 +15,7 @@ from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
-from ...core.arrays import Array, Columns, Names, Parameters, Whole, frozen
-from ...core.errors import DataError
-from ...core.rounding import TINY
+from ...core import TINY, Array, Columns, DataError, Names, Parameters, Whole, frozen
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 

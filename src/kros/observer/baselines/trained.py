@@ -7,8 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Parameters, frozen
-from ...core.errors import DataError, MissingDependencyError
+from ...core import AnyArray, Array, DataError, MissingDependencyError, Parameters, frozen
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 

@@ -16,7 +16,7 @@ from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import Array, Names, frozen
+from ...core import Array, Names, frozen
 from ...core.artifacts import Storable
 from ...lifting.intervals import Box
 from ..data import ObserverData

@@ -27,10 +27,7 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike, Names, frozen
-from ...core.errors import DataError, DimensionError, KrosError
-from ...core.lti import StateSpace
-from ...core.rounding import EPS, ROUNDING
+from ...core import EPS, ROUNDING, Array, ArrayLike, DataError, DimensionError, KrosError, Names, StateSpace, frozen
 from ...lifting.formula import delayed_name
 from ...lifting.intervals import Box, break_of, slope_bounds_of
 from ..checked import floats

@@ -28,10 +28,8 @@ from itertools import product
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, frozen
-from ...core.lti import StateSpace
+from ...core import EPS, ITERATED, ROUNDING, TINY, AnyArray, Array, StateSpace, frozen
 from ...core.norms import first_frequencies, gramian, hinf_norm, to_continuous
-from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 from .error import ErrorSystem
 
 

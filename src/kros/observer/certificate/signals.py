@@ -18,10 +18,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Names, Parameters, Record, Whole, frozen
-from ...core.rounding import AGREED, TINY
+from ...core import AGREED, TINY, Array, Flags, Names, Parameters, Record, Whole, frozen
 from ...data import EpisodeBatch
-from ...loops.filtering import recursion
+from ...loops import recursion
 from ..data import ObserverData
 from ..residual import one_step_residual
 from ..screen import screened

@@ -10,8 +10,7 @@ from dataclasses import field
 from importlib import import_module
 from typing import Any
 
-from ...core.arrays import ByName, frozen
-from ...core.errors import ConfigError
+from ...core import ByName, ConfigError, frozen
 from ..canvas import Figure
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style

@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
-from ...core.errors import ConfigError
-from ...data import EpisodeBatch
-from ...data.population import Channel, EpisodeKey, Population, Role
+from ...core import AnyArray, ConfigError, frozen
+from ...data import Channel, EpisodeBatch, EpisodeKey, Population, Role
 from ...evaluate import fit_percent
 from ...evaluate.errors import error_spectrum
 from ...evaluate.held_out import HeldOut
 from ...evaluate.sensor import as_shown
-from ...identify.identified import IdentifiedModels
+from ...identify import IdentifiedModels
 from ...observer import run_observer
 from ..canvas import Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, set_titles, thin
 from ..names import (

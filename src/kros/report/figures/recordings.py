@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...core.arrays import AnyArray
-from ...core.errors import ConfigError
-from ...data.population import EpisodeKey, Population, Role
+from ...core import AnyArray, ConfigError
+from ...data import EpisodeKey, Population, Role
 from ...data.recording import some
 from ...evaluate.errors import error_spectrum
 from ...evaluate.validation import excitation

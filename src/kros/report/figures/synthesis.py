@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...core.lti import StateSpace
+from ...core import StateSpace
 from ...design.task import split_name
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core import AnyArray
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, residual, sigma_max
 from ...uncertainty.quantify import UncertainModels, residuals_beside_weights

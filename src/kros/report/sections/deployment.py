@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ...core.arrays import ByName
+from ...core import ByName
 from ..content import Column, Section, Table, build
 from ..facts import Facts
 from ..names import axis_label, joined, label_of, number, words

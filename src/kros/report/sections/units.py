@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ...core.arrays import ByName
+from ...core import ByName
 from ..content import Column, Section, build
 from ..facts import Facts
 from ..names import in_condition, number, words

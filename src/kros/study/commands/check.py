@@ -9,9 +9,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Record
+from ...core import Array, ConfigError, DataError, Flags, Record
 from ...core.artifacts import plain
-from ...core.errors import ConfigError, DataError
 from ...core.work import Executor
 from ...data import Population
 from ...data.recording import check_population

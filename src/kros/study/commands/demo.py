@@ -6,9 +6,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...core.arrays import frozen
+from ...core import ConfigError, frozen
 from ...core.artifacts import digest_of, write_json
-from ...core.errors import ConfigError
 from ...core.work import Progress
 from ...data import write_parquet
 from ...data.readers.motor_drive_raw import write_raw

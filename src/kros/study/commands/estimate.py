@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ...core import ConfigError
 from ...core.artifacts import load_artifact
-from ...core.errors import ConfigError
 from ...core.files import write_bytes
 from ...export.estimates import ENDINGS, writer
 from ...observer.units import recorded_channel, recorded_factors

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ...core import ConfigError, KrosError
 from ...core.artifacts import write_json
-from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...data.discovery.roles import identifier
 from ...evaluate.sensor import as_arriving

@@ -12,20 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.arrays import Array, Bits, Names, frozen
+from ...core import AGREED, Array, Bits, ConfigError, DataError, IdentificationError, Names, frozen
 from ...core.artifacts import load_artifact
-from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import did_you_mean, read_toml
-from ...core.rounding import AGREED
-from ...data import Population, read
-from ...data.population import EpisodeKey
+from ...data import EpisodeKey, Population, read
 from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.survey import RecordingFacts
 from ...identify.unit_phases import Texts, Values, unit_values
-from ...observer import Observer
-from ...observer.screen import SampleStatus
+from ...observer import Observer, SampleStatus
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import ConfigError, DataError
+from ...core import ConfigError, DataError
 from ...core.work import Progress, Work
 from ...data import Population
 from ...data.discovery.discover import Discovery, Wanted, discover

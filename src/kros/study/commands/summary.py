@@ -9,8 +9,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from ...core import ConfigError
 from ...core.artifacts import load_artifact
-from ...core.errors import ConfigError
 from ...core.files import write_bytes
 from ...loops.compiler import COMPILERS
 from ...report.compare import comparison, lines, sections

@@ -9,11 +9,11 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
-from ...core.arrays import Names, Record, frozen
+from ...core import Names, Record, frozen
 from ...core.artifacts import digest_of, load_artifact, write_json
 from ...core.files import stamp_of
 from ...core.work import Results, Work
-from ...data.population import EpisodeKey, Population
+from ...data import EpisodeKey, Population
 from ...data.recording import NonFiniteError
 from ...data.recording import digest_of as episode_digest
 from ...identify import PhaseCalibration, PhaseSpec
@@ -21,7 +21,7 @@ from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...identify.survey import RecordingFacts
 from ...lifting import Lifting
-from ...uncertainty.quantify import UncertainModels
+from ...uncertainty import UncertainModels
 from ..config import Stage, StudyConfig
 from .store import METRICS, STUDY, Store, code_key
 

@@ -19,8 +19,7 @@ from functools import partial
 from threading import Lock
 from typing import Any, TypeVar
 
-from ...core.arrays import frozen
-from ...core.errors import ConfigError, KrosError, MissingDependencyError
+from ...core import ConfigError, KrosError, MissingDependencyError, frozen
 from ...core.work import Executor, Progress
 from .store import code_key
 

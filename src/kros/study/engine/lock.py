@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ...core.errors import ConfigError
+from ...core import ConfigError
 
 try:
     import fcntl

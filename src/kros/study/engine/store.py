@@ -20,9 +20,8 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
-from ...core.arrays import Record, frozen
+from ...core import ConfigError, DataError, DimensionError, Record, frozen
 from ...core.artifacts import digest_of, file_digest, read_json, with_checksum, write_json
-from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy
 from ...report.manifest import INDEX, MANIFEST, Artefact, describe, place, read_manifest, recorded_files, write_manifest
 from ..config import Stage, StudyConfig, stored_config

@@ -16,14 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.arrays import ByName, frozen
-from ...core.errors import KrosError
+from ...core import ByName, KrosError, frozen
 from ...identify import Factor, ModelSet
 from ...identify.bootstrap import bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
-from ...uncertainty import Form, UncertainModel, residual
+from ...uncertainty import Form, UncertainModel, choose_nominal, residual
 from ...uncertainty.noise import NoiseShare, noise_share
-from ...uncertainty.nominal import choose_nominal
 from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ...uncertainty.weights.cover import optimal_cover

@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import replace
 from shutil import copyfile
 
+from ...core import ConfigError, DataError
 from ...core.artifacts import save_artifact
-from ...core.errors import ConfigError, DataError
 from ...data import Population, read
 from ...data.population import OUTLIERS
 from ...data.prepare import parse_steps, prepare
 from ...design.synthesize import synthesize_all
 from ...evaluate.next_unit import draw_reserve
+from ...identify import IdentifiedModels
 from ...identify.calibration import calibrate
-from ...identify.identified import IdentifiedModels
 from ...identify.identify import with_models
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...identify.survey import Copy, check_usable, survey
 from ...observer.residual import FEWEST_SAMPLES
 from ...observer.sensor import require_measured
-from ...uncertainty.quantify import quantify
+from ...uncertainty import quantify
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep
 from .diagnose import diagnose

@@ -17,9 +17,8 @@ from functools import partial
 
 import numpy as np
 
-from ...core.arrays import Record
+from ...core import ConfigError, IdentificationError, KrosError, Record
 from ...core.artifacts import load_artifact, save_artifact
-from ...core.errors import ConfigError, IdentificationError, KrosError
 from ...core.work import Progress
 from ...data.population import OUTLIERS, Population, split_episodes
 from ...design.task import is_robust

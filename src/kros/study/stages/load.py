@@ -14,9 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from ...core.arrays import Array, Columns, Flags, Names, Record, frozen
+from ...core import Array, Columns, ConfigError, Flags, KrosError, Names, Record, frozen
 from ...core.artifacts import load_artifact, save_artifact
-from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving

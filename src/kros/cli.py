@@ -22,8 +22,7 @@ from typing import Annotated, Any, TextIO
 import typer
 from typer.core import TyperGroup
 
-from .core import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
-from .core.work import Progress
+from .core import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError, Progress
 
 FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
 _SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]

@@ -19,18 +19,17 @@ from dataclasses import fields, is_dataclass
 from functools import cache, wraps
 from pathlib import Path
 from types import GenericAlias
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter
 from pydantic_core import to_jsonable_python
 
 from . import limits
-from .arrays import ByName, Record
+from .arrays import ByName, Record, T
 from .errors import DataError, KrosError
 from .files import pass_on_shortage, read_bytes, shortened, write_bytes
 
-T = TypeVar("T")
 SCHEMA = 1
 CHECKSUM, _ARRAY = "checksum", "array in arrays.npz"
 _AGAIN = "write it again with the step that made it"

@@ -232,8 +232,7 @@ def crossings(system: StateSpace, gamma: float) -> AnyArray:
     """Frequencies at which a singular value may equal `gamma`, with the points between them."""
     A, B, C, D = system.A, system.B, system.C, system.D
     R = gamma**2 * np.eye(system.n_inputs) - D.T @ D
-    F = np.linalg.solve(R, np.hstack([D.T @ C, B.T]))
-    n = system.n_states
+    F, n = np.linalg.solve(R, np.hstack([D.T @ C, B.T])), system.n_states
     closed = A + B @ F[:, :n]
     # gamma scales the two halves alike, which keeps the eigenvalues and balances the blocks.
     Q = C.T @ C + C.T @ D @ F[:, :n]

@@ -13,17 +13,16 @@ from dataclasses import field
 from functools import partial
 from operator import call
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from .arrays import frozen
+from .arrays import T, frozen
 from .artifacts import digest_of, divided, json_bytes, pack_arrays, united, unpack_arrays
 from .errors import DataError
 from .files import read_bytes, write_bytes
 from .limits import MAX_ARRAYS_BYTES
 
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, Columns, DataError, Names, Record
-from ..core.settings import member
+from ..core import Array, ByName, Columns, DataError, Names, Record, member
 from .shown import Shown
 
 DEFAULT_CONDITION = "default"

@@ -10,9 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ValidationError
 
-from ..core import Array, ByName, ConfigError, DataError, Record, frozen
-from ..core.artifacts import digest_of, united
-from ..core.files import shortened, stamp_of
+from ..core import Array, ByName, ConfigError, DataError, Record, digest_of, frozen, shortened, stamp_of, united
 from .population import Channel, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key, part_columns
 from .recording import (
     Recording,

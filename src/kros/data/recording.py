@@ -17,9 +17,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import AGREED, ROUNDING, DataError, limits
+from ..core import AGREED, ROUNDING, DataError, limits, shortened
 from ..core.arrays import Array, Flags, Index, frozen
-from ..core.files import shortened
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 

@@ -29,8 +29,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ConfigDict
 
-from ..core import Array, ConfigError, DataError, Names, limits, refusing
-from ..core.files import did_you_mean
+from ..core import Array, ConfigError, DataError, Names, did_you_mean, limits, refusing
 from .population import Channel, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 

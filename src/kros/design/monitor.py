@@ -16,8 +16,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from ..core import EPS, ITERATED, ROUNDING, Array, Flags, frozen
-from ..core.work import Work
+from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen
 from ..observer import Observer
 from ..observer.estimator.regression import spread
 from ..observer.monitor import WEIGHT, Monitor, octaves

@@ -17,10 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, ConfigError, Names, Record, SynthesisError, frozen
-from ..core.artifacts import plain
-from ..core.settings import require_kind
-from ..core.work import Work
+from ..core import Array, ByName, ConfigError, Names, Record, SynthesisError, Work, frozen, plain, require_kind
 from ..data.population import scaling_of
 from ..identify import IdentifiedModels, ModelSet
 from ..lifting import Lifting

@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core import Array, ByName, Names, Record, SynthesisError, frozen, gain
-from ..core.artifacts import load_artifact, loader, save_artifact
+from ..core import Array, ByName, Names, Record, SynthesisError, frozen, gain, load_artifact, loader, save_artifact
 from ..data.shown import Shown
 from ..identify import ModelSet
 from ..observer import Observer, ReliftCertificate, Runtime

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core import Array, Bits, Record
-from ..core.artifacts import write_json
+from ..core import Array, Bits, Record, write_json
 from ..data import EpisodeKey
 from ..observer import SampleStatus
 

@@ -34,9 +34,9 @@ from ..core import (
     Record,
     StateSpace,
     frozen,
+    member,
 )
 from ..core.linalg import balanced_size
-from ..core.settings import member
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .filter_bank import FilterBank

@@ -14,10 +14,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, create_model
 
-from ..core import ByName, DataError, KrosError, Record, StateSpace
+from ..core import ByName, DataError, KrosError, Record, Settings, StateSpace, shortened
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
-from ..core.files import shortened
-from ..core.settings import Settings
 from ..lifting import Lifting
 from .data import ObserverData
 from .filter_bank import FilterBank

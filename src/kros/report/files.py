@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from ..core import ConfigError
-from ..core.files import write_bytes
-from ..core.work import Progress
+from ..core import ConfigError, Progress, write_bytes
 from .canvas import Figure, settle
 from .figures import FIGURES, draw_all
 from .run_folder import RunFolder

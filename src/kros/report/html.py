@@ -9,8 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ..core import ByName, Record
-from ..core.files import write_bytes
+from ..core import ByName, Record, write_bytes
 from .content import Section
 from .facts import Facts
 from .figures import draw

@@ -14,10 +14,8 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from pydantic import Field, NonNegativeFloat
 
-from ..core import ConfigError, DataError
+from ..core import ConfigError, DataError, Settings, is_file, stamp_of
 from ..core.artifacts import CHECKSUM, check_checksum, file_digest, read_json, with_checksum, write_json
-from ..core.files import is_file, stamp_of
-from ..core.settings import Settings
 
 MANIFEST, INDEX = "manifest.json", "artefact.json"
 Described = tuple[str, int, int]  # SHA-256, size in bytes, time of the last change in ns

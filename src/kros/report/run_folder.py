@@ -8,22 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
 from urllib.parse import unquote
 
 import numpy as np
 
-from ..core import AnyArray, Names, Record, frozen
-from ..core.artifacts import load_artifact, read_json
+from ..core import AnyArray, Names, Record, frozen, load_artifact, read_json
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
 from .manifest import MANIFEST, recorded_files
-from .names import linear_first
-
-T = TypeVar("T")
+from .names import T, linear_first
 
 
 class NotShownError(Exception):

@@ -9,9 +9,8 @@ from enum import StrEnum
 from pathlib import Path
 from xml.etree import ElementTree
 
-from ..core import ConfigError, Record
+from ..core import ConfigError, Record, write_bytes
 from ..core.artifacts import json_bytes
-from ..core.files import write_bytes
 from ..uncertainty.outliers.score import FEWEST_UNITS, Status
 from .content import Column, Section, build
 from .html import filled

@@ -10,9 +10,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from ..core import ConfigError, Names, Record
-from ..core.files import read_toml, shortened
-from ..core.settings import Settings
+from ..core import ConfigError, Names, Record, Settings, read_toml, shortened
 from ..data.readers.csv_folder import mapping_schema
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings

@@ -7,10 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core import ByName, ConfigError, Record
-from ..core.artifacts import write_json
-from ..core.settings import member
-from ..core.work import Executor, Progress, Work
+from ..core import ByName, ConfigError, Executor, Progress, Record, Work, member, write_json
 from ..data import Population
 from ..data.readers.opening import detect_reader
 from ..data.shown import Shown

@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import Array, ConfigError, DataError, Names, Record, frozen
-from ...core.files import did_you_mean
-from ...core.work import Work
+from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_mean, frozen
 from ..measures import split_header
 from ..population import EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder

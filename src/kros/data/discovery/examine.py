@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import DataError, frozen
-from ...core.work import Work
+from ...core import DataError, Work, frozen
 from ..population import EpisodeKey, Population
 from ..recording import GroupWatch, NonFiniteError, check_episode, check_increasing, copies_among, digest_of
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import Array, ByName, DataError, frozen
-from ...core.files import shortened
+from ...core import Array, ByName, DataError, frozen, shortened
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_period, title

@@ -16,9 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
-from ...core import Array, ByName, Columns, DataError, Names, Record, frozen
-from ...core.files import did_you_mean, read_toml
-from ...core.settings import Settings
+from ...core import Array, ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
 from ..measures import clean_unit, measure, split_header
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import DataError
-from ...core.files import whole_folder
+from ...core import DataError, whole_folder
 from ..population import OUTLIERS, Channel, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim
 from .csv_folder import ChannelMapping, CsvMapping, csv_files, read_csv_folder

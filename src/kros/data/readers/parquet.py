@@ -21,8 +21,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core import Array, DataError, Names, Record, frozen
-from ...core.artifacts import load_artifact, save_artifact, united
+from ...core import Array, DataError, Names, Record, frozen, load_artifact, save_artifact, united
 from ...core.files import draft_beside, pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
 from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ...core import AnyArray, Array, Record, frozen
+from ...core import AnyArray, Array, Record, frozen, whole_folder, write_bytes
 from ...core.artifacts import json_bytes, with_checksum
-from ...core.files import whole_folder, write_bytes
 from ...observer import Observer
 from ...observer.file import observer_content
 from .numbers import TOLERANCE, LoadOutput, Source

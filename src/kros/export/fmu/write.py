@@ -15,8 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ...core import ConfigError
-from ...core.files import write_bytes
+from ...core import ConfigError, write_bytes
 from ...loops.compiler import compile_library, find_compiler
 from ...observer import Observer
 from ...observer.units import recorded_channel

@@ -16,8 +16,7 @@ from enum import Enum
 
 import numpy as np
 
-from ...core import Array, Names, frozen
-from ...core.artifacts import Storable
+from ...core import Array, Names, Storable, frozen
 from ...lifting.intervals import Box
 from ..data import ObserverData
 from ..units import factors

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...core.artifacts import load_artifact
+from ...core import load_artifact
 from ...evaluate.errors import error_spectrum
 from ..canvas import Figure, frequency_axis, grid, legend, logarithmic, set_titles
 from ..names import in_condition, model_label, model_look

@@ -9,9 +9,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core import Array, ConfigError, DataError, Flags, Record
-from ...core.artifacts import plain
-from ...core.work import Executor
+from ...core import Array, ConfigError, DataError, Executor, Flags, Record, plain
 from ...data import Population
 from ...data.recording import check_population
 from ...identify import ModelSet

@@ -6,9 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...core import ConfigError, frozen
-from ...core.artifacts import digest_of, write_json
-from ...core.work import Progress
+from ...core import ConfigError, Progress, digest_of, frozen, write_json
 from ...data import write_parquet
 from ...data.readers.motor_drive_raw import write_raw
 from ...identify.presets import HARMONIC_DRIVE

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import ConfigError
-from ...core.artifacts import load_artifact
-from ...core.files import write_bytes
+from ...core import ConfigError, load_artifact, write_bytes
 from ...export.estimates import ENDINGS, writer
 from ...observer.units import recorded_channel, recorded_factors
 from ..config import Stage

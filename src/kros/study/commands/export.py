@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import ConfigError, KrosError
-from ...core.artifacts import write_json
+from ...core import ConfigError, KrosError, write_json
 from ...data import EpisodeBatch
 from ...data.discovery.roles import identifier
 from ...evaluate.sensor import as_arriving

@@ -12,9 +12,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import AGREED, Array, Bits, ConfigError, DataError, IdentificationError, Names, frozen
-from ...core.artifacts import load_artifact
-from ...core.files import did_you_mean, read_toml
+from ...core import (
+    AGREED,
+    Array,
+    Bits,
+    ConfigError,
+    DataError,
+    IdentificationError,
+    Names,
+    did_you_mean,
+    frozen,
+    load_artifact,
+    read_toml,
+)
 from ...data import EpisodeKey, Population, read
 from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving

@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ...core import ConfigError, DataError
-from ...core.work import Progress, Work
+from ...core import ConfigError, DataError, Progress, Work
 from ...data import Population
 from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.text import comment, key_lines, mapping_lines

@@ -9,9 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ...core import ConfigError
-from ...core.artifacts import load_artifact
-from ...core.files import write_bytes
+from ...core import ConfigError, load_artifact, write_bytes
 from ...loops.compiler import COMPILERS
 from ...report.compare import comparison, lines, sections
 from ...report.content import Column, Section, build

@@ -12,8 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ...core import ConfigError, KrosError
-from ...core.artifacts import digest_of, write_json
+from ...core import ConfigError, KrosError, digest_of, write_json
 from ...core.files import draft_beside, is_file, link_or_copy, stamp_of
 from ...data.readers.parquet import INDEX
 from ...report.unit_verdicts import worst

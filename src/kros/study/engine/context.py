@@ -9,9 +9,7 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
-from ...core import Names, Record, frozen
-from ...core.artifacts import digest_of, load_artifact, write_json
-from ...core.files import stamp_of
+from ...core import Names, Record, digest_of, frozen, load_artifact, stamp_of, write_json
 from ...core.work import Results, Work
 from ...data import EpisodeKey, Population
 from ...data.recording import NonFiniteError

@@ -19,8 +19,7 @@ from functools import partial
 from threading import Lock
 from typing import Any, TypeVar
 
-from ...core import ConfigError, KrosError, MissingDependencyError, frozen
-from ...core.work import Executor, Progress
+from ...core import ConfigError, Executor, KrosError, MissingDependencyError, Progress, frozen
 from .store import code_key
 
 

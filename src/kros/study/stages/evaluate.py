@@ -10,8 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ...core import AnyArray, Array, ByName, KrosError, Names, Record
-from ...core.artifacts import save_artifact
+from ...core import AnyArray, Array, ByName, KrosError, Names, Record, save_artifact
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from shutil import copyfile
 
-from ...core import ConfigError, DataError
-from ...core.artifacts import save_artifact
+from ...core import ConfigError, DataError, save_artifact
 from ...data import Population, read
 from ...data.population import OUTLIERS
 from ...data.prepare import parse_steps, prepare

@@ -17,9 +17,7 @@ from functools import partial
 
 import numpy as np
 
-from ...core import ConfigError, IdentificationError, KrosError, Record
-from ...core.artifacts import load_artifact, save_artifact
-from ...core.work import Progress
+from ...core import ConfigError, IdentificationError, KrosError, Progress, Record, load_artifact, save_artifact
 from ...data.population import OUTLIERS, Population, split_episodes
 from ...design.task import is_robust
 from ...evaluate.held_out import HeldOut, Outcome

@@ -14,8 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from ...core import Array, Columns, ConfigError, Flags, KrosError, Names, Record, frozen
-from ...core.artifacts import load_artifact, save_artifact
+from ...core import Array, Columns, ConfigError, Flags, KrosError, Names, Record, frozen, load_artifact, save_artifact
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving

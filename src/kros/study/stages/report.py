@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from ...core.work import Progress
+from ...core import Progress
 from ..config import Stage
 from ..engine.context import Context
 from ..engine.executors import open_executor

@@ -28,7 +28,7 @@ from .lti import StateSpace
 from .rounding import AGREED, EPS, ITERATED, TINY
 
 _MAX_ITERATIONS = 60
-_DIGITS, _MOST_DIGITS, _MOST_STATES = 40, 160, 60  # of multiple precision, where double does not suffice
+_DIGITS, _MOST_STATES = (40, 80, 160), 60  # of multiple precision, where double does not suffice
 _AGREE = 1e-7  # relative difference of what should be equal, beyond which double precision is not trusted
 
 
@@ -252,14 +252,14 @@ def precise_h2_norm(system: StateSpace) -> float:
     if system.n_states > _MOST_STATES:
         problem = f"double precision does not suffice, and multiple precision takes at most {_MOST_STATES} states"
         raise SynthesisError(f"H2 norm: {problem}, found {system.n_states}; reduce the system, or scale its states.")
-    before, digits = None, _DIGITS
-    while digits <= _MOST_DIGITS:
+    before = np.nan
+    for digits in _DIGITS:
         with mpmath.workdps(digits):
             norm = _norm_of(mpmath, system)
-        if before is not None and (norm == before or abs(norm - before) <= ITERATED * abs(norm)):
+        if norm == before or abs(norm - before) <= ITERATED * abs(norm):
             return norm
-        before, digits = norm, 2 * digits
-    problem = f"no two results agree with up to {_MOST_DIGITS} digits"
+        before = norm
+    problem = f"no two results agree with up to {_DIGITS[-1]} digits"
     raise SynthesisError(f"H2 norm: {problem}; the system has poles on the stability limit.")
 
 
@@ -286,7 +286,7 @@ def precise_gain(system: StateSpace, freq_hz: float) -> float:
     """Largest singular value at one frequency, the resolvent in multiple precision."""
     import mpmath
 
-    with mpmath.workdps(_DIGITS):
+    with mpmath.workdps(_DIGITS[0]):
         s = mpmath.mpc(0, 2 * mpmath.pi * mpmath.mpf(freq_hz))
         point = mpmath.exp(s * mpmath.mpf(system.dt)) if system.dt > 0 else s
         A, B, C, D = (mpmath.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C, system.D))

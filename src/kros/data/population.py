@@ -74,6 +74,9 @@ class Channel:
         return f"{self.name} ({self.unit or '1'}{', measured' * self.measured})"
 
 
+Channels = tuple[Channel, ...]
+
+
 @dataclass(frozen=True)
 class Unit:
     """One machine of the batch, with what is known about it.
@@ -188,13 +191,13 @@ class Population(Shown):
     (5, 2)
     """
 
-    channels: tuple[Channel, ...]
+    channels: Channels
     sample_period_s: float
     units: tuple[Unit, ...]
     episodes: tuple[EpisodeKey, ...]
     source: Any  # kros.data.prepare.PreparedSource
     metadata: ByName = field(default_factory=dict)
-    truths: tuple[Channel, ...] = ()
+    truths: Channels = ()
     scaling: Mapping[str, Scaling] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -211,7 +214,7 @@ class Population(Shown):
         return {**counts, "conditions": ", ".join(self.conditions), "period": f"{self.sample_period_s:g} s", **rows}
 
     @property
-    def columns(self) -> tuple[Channel, ...]:
+    def columns(self) -> Channels:
         """All columns of the source: channels, then truths."""
         return self.channels + self.truths
 

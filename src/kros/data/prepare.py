@@ -11,7 +11,16 @@ import numpy as np
 from pydantic import ValidationError
 
 from ..core import Array, ByName, ConfigError, DataError, Record, digest_of, frozen, shortened, stamp_of, united
-from .population import Channel, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key, part_columns
+from .population import (
+    Channels,
+    EpisodeKey,
+    Population,
+    Scalings,
+    Unit,
+    columns_in_order,
+    natural_key,
+    part_columns,
+)
 from .recording import (
     Recording,
     Recordings,
@@ -32,7 +41,7 @@ class PreparedSource:
     """Read a recording, check its time, apply the steps, check the result."""
 
     recordings: Recordings
-    channels: tuple[Channel, ...]  # as recorded: states, inputs, truths
+    channels: Channels  # as recorded: states, inputs, truths
     period_s: float  # as recorded, found in the episode `reference`
     reference: EpisodeKey
     steps: tuple[Step, ...] = ()
@@ -52,7 +61,7 @@ class PreparedSource:
             file = self.recordings.file(self.recordings.places[recording.key])
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
 
-    def _prepared(self, recording: Recording) -> tuple[Array, tuple[Channel, ...]]:
+    def _prepared(self, recording: Recording) -> tuple[Array, Channels]:
         """Return what steps make of an episode, or of a part of it, and the channels."""
         signals = Signals(self.channels, self.period_s)
         # A running observer has to see that a sample is missing; training does not.
@@ -86,7 +95,7 @@ class PreparedSource:
 
 def assemble(
     recordings: Recordings,
-    channels: tuple[Channel, ...],
+    channels: Channels,
     units: Iterable[Unit] = (),
     sample_period_s: float | None = None,
     metadata: ByName | None = None,
@@ -180,7 +189,7 @@ class _Divide(Step):
     sizes: tuple[float, ...]
     samplewise: ClassVar[bool] = True
 
-    def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording in the sizes."""
         return replace(recording, values=recording.values / np.array(self.sizes))
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, ConfigError, Names, Record, SynthesisError, Work, frozen, plain, require_kind
+from ..core import Array, ByName, ConfigError, Record, SynthesisError, Work, frozen, plain, require_kind
 from ..data.population import scaling_of
 from ..identify import IdentifiedModels, ModelSet
 from ..lifting import Lifting
@@ -52,14 +52,7 @@ class Designs:
 
     designs: Mapping[str, Design]
     deployed: str
-    failed: Mapping[str, str]  # reasons
-    order: Names
-
-    @property
-    def facts(self) -> dict[str, Record]:
-        """What the metrics say of every observer, designed or not."""
-        failed = {name: {"status": "failed", "reason": reason} for name, reason in self.failed.items()}
-        return {name: failed.get(name) or dict(self.designs[name].facts) for name in self.order}
+    facts: Mapping[str, ByName]  # what the metrics say of every observer, designed or not
 
 
 def synthesize(
@@ -155,7 +148,8 @@ def synthesize_all(
         known = {"false_alarm_rate": monitor.false_alarm_rate, "units": monitor.units, "settle_samples": monitor.settle}
         facts = {**design.facts, "monitor": known}
         designs[deployed] = replace(design, observer=replace(design.observer, monitor=monitor), facts=facts)
-    return Designs(designs, deployed, failed, tuple(task.name for task in tasks))
+    reasons: dict[str, ByName] = {name: {"status": "failed", "reason": reason} for name, reason in failed.items()}
+    return Designs(designs, deployed, {t.name: reasons.get(t.name) or designs[t.name].facts for t in tasks})
 
 
 def _named(uncertain: UncertainModels, method: str | Method, estimator: EstimatorSettings) -> tuple[str, Method]:

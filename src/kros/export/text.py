@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
-from ..core import ByName, ConfigError
+from ..core import ConfigError
 
 _ALLOWED = frozenset(" _-.,:;+()[]%/^=@°·²³")  # beside letters and digits of any script
 _C_WORDS = re.compile(
@@ -60,12 +60,3 @@ def require_identifier(name: str, what: str = "name") -> str:
             "begins with a letter, and no word of C."
         )
     return name
-
-
-def rendered(package: str, files: Mapping[str, str], context: ByName, filters: ByName) -> dict[str, str]:
-    """Return the text of every file, by its name and that of its template in a package."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
-    environment.filters |= filters
-    return {file: environment.get_template(f"{template}.jinja").render(context) for file, template in files.items()}

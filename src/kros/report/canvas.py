@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 else:  # for annotations alone: matplotlib is imported when something is drawn
     Artist = Axes = Figure = Any
 
+Captioned = tuple[Figure, str]  # a figure and more of its caption
 _PREFIXES = "pnµm kMG"  # powers of a thousand, from 10⁻¹²
 
 

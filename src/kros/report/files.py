@@ -28,12 +28,11 @@ _BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")  # a hundredth of a point is enough
 
 def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
     """Write every figure of a run as PNG and PDF to a folder; return the names of the files in their order."""
-    out = Path(out)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
     names, progress, began = [], progress or Progress(), time.perf_counter()
     progress.start("figures", len(FIGURES))
-    for drawn in draw_all(RunFolder(Path(run))):
+    for drawn in draw_all(RunFolder(run)):
         progress.advance()
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)

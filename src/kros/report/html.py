@@ -33,8 +33,8 @@ def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = 
 
     `mapped` maps the drawing of a figure over their names, in order, for example in several processes.
     """
-    path = out if out is not None else Path(run) / "report.html"
-    write_bytes(path, page(RunFolder(Path(run)), metrics, mapped).encode())
+    path = out if out is not None else run / "report.html"
+    write_bytes(path, page(RunFolder(run), metrics, mapped).encode())
     return path
 
 
@@ -83,7 +83,7 @@ def encoded(run: RunFolder, name: str) -> Encoded:
     drawn = draw(name, run)
     svg = "" if drawn.figure is None else to_svg(drawn.figure, name)
     svg = svg.replace('role="img"', f'role="img" aria-label="{escape(drawn.title)}"', 1)
-    return {"name": name, "title": drawn.title, "svg": svg, "caption": drawn.caption, "reason": drawn.reason}
+    return vars(drawn) | {"svg": svg, "figure": None}
 
 
 def stylesheet() -> str:

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from ..core import AnyArray, Names, Record, frozen, load_artifact, read_json
-from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
+from ..data.population import OUTLIERS, Channel, Channels, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
@@ -77,7 +77,7 @@ class RunFolder:
         return [unit for unit, group in self.facts["groups"].items() if group == OUTLIERS]
 
     @cached_property
-    def channels(self) -> tuple[Channel, ...]:
+    def channels(self) -> Channels:
         """Channels with their units of measure."""
         return next(iter(self.models.values())).channels
 

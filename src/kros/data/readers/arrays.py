@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core import Array, ByName, DataError, frozen, shortened
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
+from ..population import DEFAULT_CONDITION, Channel, Channels, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_period, title
 
@@ -28,7 +28,7 @@ class ArrayRecordings(Recordings):
 
 def declare_channels(
     channels: Sequence[Channel] | None, states: Sequence[str], inputs: Sequence[str], measured: Sequence[str], what: str
-) -> tuple[Channel, ...]:
+) -> Channels:
     """Return the channels as given, or those that the names declare."""
     if (channels is None) != bool(states):
         actual = f"found states = {list(states)} and channels = {channels!r}"

@@ -18,7 +18,17 @@ from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_vali
 
 from ...core import Array, ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
 from ..measures import clean_unit, measure, split_header
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
+from ..population import (
+    DEFAULT_CONDITION,
+    Channel,
+    Channels,
+    EpisodeKey,
+    Population,
+    Role,
+    Scaling,
+    Unit,
+    columns_in_order,
+)
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import STEPS, Scale, Step
@@ -153,7 +163,7 @@ class CsvMapping(Settings):
         return columns_in_order(self.channel)
 
     @property
-    def channels(self) -> tuple[Channel, ...]:
+    def channels(self) -> Channels:
         """The population's channels."""
         return tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in self.ordered)
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from ...core import Array, DataError, Names, Record, frozen, load_artifact, save_artifact, united
 from ...core.files import draft_beside, pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
-from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
+from ..population import Channels, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_structure, refuse_copies, usable_episodes
 from .tables import BLOCK, from_numpy, repeated, to_numpy
@@ -174,11 +174,11 @@ class _Index:
     """Content of `population.json`."""
 
     sample_period_s: float
-    channels: tuple[Channel, ...]
+    channels: Channels
     units: tuple[Unit, ...]
     metadata: Record
     groups: tuple[GroupRecord, ...]
-    truths: tuple[Channel, ...] = ()
+    truths: Channels = ()
     scaling: dict[str, Scaling] = field(default_factory=dict)
 
 

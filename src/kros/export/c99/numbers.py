@@ -17,7 +17,7 @@ from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
-from ..text import plain, plain_names, rendered, require_identifier
+from ..text import plain, plain_names, require_identifier
 from .origin import OriginShift, find_shift
 from .realise import RULE, realised
 
@@ -78,9 +78,13 @@ class Source:
 
     def rendered(self, package: str, files: Mapping[str, str], more: Record) -> dict[str, str]:
         """Return the text of every file, by its name and that of its template in a package."""
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+
+        environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
         filters = {"row": self.row, "sums": self.sums, "literal": self.precision.literal, "code": self.code}
-        filters |= {"double": DOUBLE.literal, "wide": row, "plain": plain}
-        return rendered(package, files, self.context() | more, filters)
+        environment.filters |= filters | {"double": DOUBLE.literal, "wide": row, "plain": plain}
+        context = self.context() | more
+        return {file: environment.get_template(f"{name}.jinja").render(context) for file, name in files.items()}
 
     def context(self) -> Record:
         """Return what the templates name: the observer and its parts, names, sizes, and matrices."""

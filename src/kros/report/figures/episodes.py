@@ -16,7 +16,7 @@ from ...evaluate.held_out import HeldOut
 from ...evaluate.sensor import as_shown
 from ...identify import IdentifiedModels
 from ...observer import run_observer
-from ..canvas import Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, set_titles, thin
+from ..canvas import Axes, Captioned, Figure, frequency_axis, grid, label_below, legend, logarithmic, set_titles, thin
 from ..names import (
     Look,
     condition_label,
@@ -69,7 +69,7 @@ class Block:
     states: Sequence[int]
 
 
-def free_run(run: RunFolder) -> tuple[Figure, str]:
+def free_run(run: RunFolder) -> Captioned:
     """Draw the simulation of a held-out episode of the nominal unit (the paper's Figures 5 and 6)."""
     shown = run.shown[0]
     if not shown.models:
@@ -80,7 +80,7 @@ def free_run(run: RunFolder) -> tuple[Figure, str]:
     return _figure(run, [block], text)
 
 
-def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
+def estimates(run: RunFolder, paper: bool = False) -> Captioned:
     """Draw estimates for the nominal and the worst off-nominal unit (the paper's Figures 11 and 12)."""
     shown = [s for s in run.shown if s.key.condition == run.identify_on][:2]
     if not shown or not shown[0].observers:
@@ -99,7 +99,7 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
     return _figure(run, blocks, text)
 
 
-def other_condition(run: RunFolder) -> tuple[Figure, str]:
+def other_condition(run: RunFolder) -> Captioned:
     """Draw the paper's observers, or the deployed one, in a condition that no model has seen (Figures 13 and 14)."""
     shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
     if shown is None or not shown.observers:
@@ -117,7 +117,7 @@ def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[i
     return Block(title, shown, lines, states)
 
 
-def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> tuple[Figure, str]:
+def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> Captioned:
     """Return the figure of some episodes of a run and its caption."""
     signals = Signals.of(run)
     text += " Shaded: the band around the gearbox frequency at top speed." if signals.band_hz else ""

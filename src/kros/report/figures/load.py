@@ -6,7 +6,7 @@ import numpy as np
 
 from ...core import load_artifact
 from ...evaluate.errors import error_spectrum
-from ..canvas import Figure, frequency_axis, grid, legend, logarithmic, set_titles
+from ..canvas import Captioned, frequency_axis, grid, legend, logarithmic, set_titles
 from ..names import in_condition, model_label, model_look
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING
@@ -15,7 +15,7 @@ from .episodes import TRUTH, draw_line, hide_times
 _WAYS = (("load", "load state"), ("current", "error of the\nrecorded current"))
 
 
-def load_torque(run: RunFolder) -> tuple[Figure, str]:
+def load_torque(run: RunFolder) -> Captioned:
     """Draw estimates of the load over an episode and spectra of their errors, a row a way to estimate."""
     if not run.has("load/load.json"):
         raise NotShownError("this study declares no load; set load.moment")

@@ -8,7 +8,7 @@ from ...data import EpisodeBatch
 from ...evaluate.validation import correlation
 from ...identify import IdentifiedModels, ModelSet
 from ...observer.residual import one_step_residual
-from ..canvas import Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, set_titles
+from ..canvas import Captioned, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, set_titles
 from ..names import model_label, model_look, readable_unit, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
@@ -16,7 +16,7 @@ from .entries import short
 from .episodes import label_rows, shown_episode
 
 
-def bode(run: RunFolder) -> tuple[Figure, str]:
+def bode(run: RunFolder) -> Captioned:
     """Draw the Koopman models, or the linear ones where there are no others."""
     models = run.models[run.kinds[0]]
     text = f"{len(models.unit_ids)} {model_label(models.name)} models, every signal over its largest value."

@@ -7,13 +7,13 @@ import numpy as np
 from ...data.population import natural_key
 from ...data.recording import some
 from ...uncertainty import OutlierModel
-from ..canvas import Axes, Figure, grid, name_units, note, units_axis
+from ..canvas import Axes, Captioned, grid, name_units, note, units_axis
 from ..names import condition_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
 
 
-def scores(run: RunFolder) -> tuple[Figure, str]:
+def scores(run: RunFolder) -> Captioned:
     """Draw one point a unit with its range, flagged ones in the colour of alarm, a column a condition."""
     models = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
     first = next(iter(models.values()))

@@ -11,6 +11,7 @@ from ...evaluate.errors import error_spectrum
 from ...evaluate.validation import excitation
 from ...identify import PhaseCalibration
 from ..canvas import (
+    Captioned,
     Figure,
     frequency_axis,
     grid,
@@ -37,7 +38,7 @@ def recorded_episodes(run: RunFolder) -> list[Shown]:
     return sorted(episodes, key=lambda s: s.key.condition != run.identify_on)
 
 
-def signals(run: RunFolder) -> tuple[Figure, str]:
+def signals(run: RunFolder) -> Captioned:
     """Draw one episode in at most two conditions, side by side, with references."""
     shown, channels, targets = recorded_episodes(run)[:2], run.states[: DRAWING.states], references(run.channels)
     figure, axes = grid(len(channels), len(shown), sharey="row", sharex="col")
@@ -100,7 +101,7 @@ def excitation_figure(population: Population, unit: str | None = None, condition
     return figure
 
 
-def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
+def tracking_spectrum(run: RunFolder) -> Captioned:
     """Draw the spectrum of the tracking error at constant speed in every condition (the paper's Figure 4)."""
     spec = run.calibration.spec
     figure, axes = grid(1, 1)
@@ -140,7 +141,7 @@ def _tracking(run: RunFolder, shown: Shown) -> tuple[AnyArray, AnyArray, float]:
     return spectra[0][0], density, spec.ratio * float(np.abs(reference).max()) / (2 * np.pi)
 
 
-def phase(run: RunFolder) -> tuple[Figure, str]:
+def phase(run: RunFolder) -> Captioned:
     """Draw the phase calibration of a run (Appendix B)."""
     calibration = run.calibration
     lags = np.degrees([c.lag_rad for u, c in calibration.units.items() if u not in run.set_aside])

@@ -10,7 +10,7 @@ from ...core import StateSpace
 from ...design.task import split_name
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis
-from ..canvas import Axes, Figure, decibel, frequency_axis, grid, legend
+from ..canvas import Axes, Captioned, decibel, frequency_axis, grid, legend
 from ..names import label_of, method_look, model_label
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone
@@ -18,7 +18,7 @@ from ..theme import DRAWING, Tone
 Curve = tuple[str, np.ndarray, str, str]
 
 
-def bode(run: RunFolder) -> tuple[Figure, str]:
+def bode(run: RunFolder) -> Captioned:
     """Draw plant, weights and filters, linear beside Koopman (the paper's Figure 10)."""
     designed = {n: s for n, s in run.syntheses.items() if not label_of(n).baseline}
     robust = {n: s for n, s in designed.items() if split_name(n)[1] != "estimator"}  # which corrects no model

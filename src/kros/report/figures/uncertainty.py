@@ -14,6 +14,7 @@ from ...uncertainty.unit_residuals import UnitResiduals
 from ...uncertainty.weights.cover import Cover
 from ..canvas import (
     Axes,
+    Captioned,
     Figure,
     decibel,
     frequency_axis,
@@ -42,7 +43,7 @@ _PUBLISHED = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  #
 _INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 
 
-def forms(run: RunFolder) -> tuple[Figure, str]:
+def forms(run: RunFolder) -> Captioned:
     """Draw the largest residuals in all forms, linear beside Koopman (the paper's Figure 7)."""
     chosen = run.uncertain
     tall = {n: m for n, m in chosen.items() if n in run.models and len(m.output_scale) > len(m.input_scale)}
@@ -81,7 +82,7 @@ def draw_forms(axes: Axes, model: UncertainModel) -> None:
     frequency_axis(axes, model.freqs_hz)
 
 
-def weights(run: RunFolder) -> tuple[Figure, str]:
+def weights(run: RunFolder) -> Captioned:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
     rows = {n: (run.uncertain[n], run.models[n], residuals) for n, residuals in run.unit_residuals.items()}
     parts = [f"{model_label(n)} {number(model.overbound_db_max)} dB" for n, (model, _, _) in rows.items()]
@@ -155,7 +156,7 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     frequency_axis(axes, freqs, "")
 
 
-def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
+def weights_entrywise(run: RunFolder) -> Captioned:
     """Draw residuals entry by entry with their fitted weights (the paper's Figure 8 as published)."""
     chosen = run.unit_residuals
     names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
@@ -167,7 +168,7 @@ def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
     return entries_figure(chosen, names), text
 
 
-def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
+def outlier_residuals(run: RunFolder) -> Captioned:
     """Draw the residual of the highest-scoring unit beside those of the others (the paper's Figure 15)."""
     first = next(iter(run.others.values()))
     unit = first.outside[0]

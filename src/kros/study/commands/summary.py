@@ -65,13 +65,13 @@ def ranking(facts: Facts) -> list[str]:
 def list_run(run: Path) -> list[str]:
     """Return what was studied, which stages are done, the observers in the order of their errors, and the verdict."""
     with open_finished(run) as (config, store):
-        records = {stage.value: store.record(stage) for stage in Stage}
-        done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]
+        manifest = store.manifest
+        done = [f"{stage} {manifest[stage].seconds:.3g} s" for stage in Stage if stage in manifest]
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
         if store.path(METRICS).exists():
             result = RunResult(store.folder, store.metrics())
             return lines + ranking(Facts(result.metrics)) + result.summary().splitlines()[1:]
-        if store.record(Stage.SYNTHESIZE) is not None:
+        if Stage.SYNTHESIZE in manifest:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]
             lines += [f"observers: {', '.join(names)}"]
         return [*lines, "the run has not ended; the same command of kros run goes on with it"]

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
 
 from ...core import Names, Record, digest_of, frozen, load_artifact, stamp_of, write_json
 from ...core.work import Results, Work
@@ -157,7 +156,7 @@ def inputs_digest(context: Context) -> str:
     if given is not None:
         declared = (given.columns, given.sample_period_s, given.units, sorted(given.metadata.items()))
         return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
-    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [Path(source)]
+    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
     return digest_of([(str(f), *stamp_of(f)) for f in files])
 
 

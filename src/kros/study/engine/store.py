@@ -276,7 +276,6 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
 @contextmanager
 def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[tuple[StudyConfig, Store]]:
     """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
-    folder = Path(folder)
     load_run(folder)
     with locked(folder, shared=not alone):
         config, store = load_run(folder)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..core import Array, ByName, ConfigError, Record, SynthesisError, Work, frozen, plain, require_kind
-from ..data.population import scaling_of
+from ..data import scaling_of
 from ..identify import IdentifiedModels, ModelSet
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor

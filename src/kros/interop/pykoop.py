@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..core import Array, ArrayLike, DataError
-from ..data.population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role
+from ..data import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role
 from ..data.readers.arrays import as_numbers, from_arrays
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..core import ByName, Names, frozen
-from ..data.population import natural_key
+from ..data import natural_key
 
 Rows = Sequence[ByName]
 

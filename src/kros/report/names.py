@@ -7,7 +7,7 @@ from math import floor, isfinite, log10
 from typing import TypeVar
 
 from ..core import frozen
-from ..data.population import DEFAULT_CONDITION, EpisodeKey
+from ..data import DEFAULT_CONDITION, EpisodeKey
 from ..design.baselines import BASELINES
 from ..design.methods import METHODS
 from ..design.task import Label, split_name

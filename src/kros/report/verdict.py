@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 
 from ..core import ByName, frozen
-from ..data.recording import some
+from ..data import some
 from ..design.task import split_name
 from .error_tables import ErrorCell, ErrorTable, tables_of
 from .facts import Facts

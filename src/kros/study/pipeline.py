@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import ByName, ConfigError, Executor, Progress, Record, Work, member, write_json
-from ..data import Population
-from ..data.readers.opening import detect_reader
-from ..data.shown import Shown
+from ..data import Population, Shown, detect_reader
 from ..observer import Observer
 from ..report.facts import Facts
 from ..report.verdict import judge

@@ -9,8 +9,7 @@ from itertools import product
 import numpy as np
 
 from ...core import Array, Parameters, frozen
-from ...data import EpisodeBatch
-from ...data.batch import hold_missing
+from ...data import EpisodeBatch, hold_missing
 
 
 @frozen

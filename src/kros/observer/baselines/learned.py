@@ -16,8 +16,7 @@ from collections.abc import Collection, Iterable, Sequence
 import numpy as np
 
 from ...core import TINY, Array, Columns, DataError, Names, Parameters, Whole, frozen
-from ...data import EpisodeBatch
-from ...data.batch import hold_missing
+from ...data import EpisodeBatch, hold_missing
 
 
 @frozen

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...data.population import natural_key
-from ...data.recording import some
+from ...data import natural_key, some
 from ...uncertainty import OutlierModel
 from ..canvas import Axes, Captioned, grid, name_units, note, units_axis
 from ..names import condition_label, number, words

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core import AnyArray, ConfigError
-from ...data import EpisodeKey, Population, Role
-from ...data.recording import some
+from ...data import EpisodeKey, Population, Role, some
 from ...evaluate.errors import error_spectrum
 from ...evaluate.validation import excitation
 from ...identify import PhaseCalibration

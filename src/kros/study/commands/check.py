@@ -10,8 +10,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ...core import Array, ConfigError, DataError, Executor, Flags, Record, plain
-from ...data import Population
-from ...data.recording import check_population
+from ...data import Population, check_population
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes

@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from ...core import ConfigError, DataError, Progress, Work
-from ...data import Population
+from ...data import Population, check_population, detect_reader
 from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.text import comment, key_lines, mapping_lines
-from ...data.readers.opening import detect_reader
-from ...data.recording import check_population
 from ...identify.survey import UNLOADED, survey
 from ..config import study_schema, validate_config
 from ..stages.learning import FEWEST, open_source

@@ -10,8 +10,7 @@ from functools import cached_property
 
 from ...core import Names, Record, digest_of, frozen, load_artifact, stamp_of, write_json
 from ...core.work import Results, Work
-from ...data import EpisodeKey, Population
-from ...data.recording import NonFiniteError
+from ...data import EpisodeKey, NonFiniteError, Population
 from ...data.recording import digest_of as episode_digest
 from ...identify import PhaseCalibration, PhaseSpec
 from ...identify.identified import IdentifiedModels, recordings_of

@@ -6,8 +6,7 @@ from dataclasses import replace
 from shutil import copyfile
 
 from ...core import ConfigError, DataError, save_artifact
-from ...data import Population, read
-from ...data.population import OUTLIERS
+from ...data import OUTLIERS, Population, read
 from ...data.prepare import parse_steps, prepare
 from ...design.synthesize import synthesize_all
 from ...evaluate.next_unit import draw_reserve

@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from ...core import ConfigError, IdentificationError, KrosError, Progress, Record, load_artifact, save_artifact
-from ...data.population import OUTLIERS, Population, split_episodes
+from ...data import OUTLIERS, Population, split_episodes
 from ...design.task import is_robust
 from ...evaluate.held_out import HeldOut, Outcome
 from ...evaluate.next_unit import fewest_units, next_unit_bound

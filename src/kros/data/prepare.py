@@ -11,16 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from ..core import Array, ByName, ConfigError, DataError, Record, digest_of, frozen, shortened, stamp_of, united
-from .population import (
-    Channels,
-    EpisodeKey,
-    Population,
-    Scalings,
-    Unit,
-    columns_in_order,
-    natural_key,
-    part_columns,
-)
+from .population import Channels, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key, part_columns
 from .recording import (
     Recording,
     Recordings,

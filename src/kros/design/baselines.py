@@ -179,10 +179,7 @@ def difference(u: Array, motion: Array, sizes: Array) -> float:
 
 
 def make_mean_profile(
-    training: TrainingSet,
-    measured: Columns,
-    population: Population,
-    keys: Iterable[EpisodeKey],
+    training: TrainingSet, measured: Columns, population: Population, keys: Iterable[EpisodeKey]
 ) -> Baseline:
     """Average the states of training episodes that have the same motions, over units, and without each unit."""
     n, same = len(population.states), DEFAULT.same_motion

@@ -196,11 +196,6 @@ class DesignTask:
         return first, ranks[first][1]
 
 
-def is_robust(facts: ByName) -> bool:
-    """Return whether the facts about an observer hold a certificate for the set of plants."""
-    return facts.get("worst_case_h2") is not None
-
-
 def split_name(observer: str) -> tuple[str, str]:
     """Return kind of model and method of an observer's name; what has no model has an empty kind."""
     kind, _, method = observer.rpartition("/")

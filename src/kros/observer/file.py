@@ -72,13 +72,7 @@ def _part(kind: Any) -> Any:
     return create_model(f"_{kind.__name__}", __base__=_Part, **held)
 
 
-_PARTS: Record = {
-    "runtime": Runtime,
-    "seen": Seen,
-    "filter_bank": FilterBank,
-    "guard": Guard,
-    "monitor": Monitor,
-}
+_PARTS: Record = {"runtime": Runtime, "seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
 
 
 def _field(key: str) -> str:

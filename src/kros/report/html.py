@@ -67,13 +67,7 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     script = Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8"))
-    look: Record = {
-        "style": Markup(stylesheet()),
-        "script": script,
-        "head": None,
-        "evidence": (),
-        "figures": {},
-    }
+    look: Record = {"style": Markup(stylesheet()), "script": script, "head": None, "evidence": (), "figures": {}}
     template = environment.get_template("report.html.jinja")
     return template.render(look | parts, name=name, subtitle=subtitle, sections=sections)
 

@@ -134,10 +134,7 @@ class ReliftCertificate(Storable):
 
 
 def relift_certificate(
-    observer: ObserverData,
-    box: Box | None = None,
-    scales: ReliftScales | None = None,
-    parameters: Box | None = None,
+    observer: ObserverData, box: Box | None = None, scales: ReliftScales | None = None, parameters: Box | None = None
 ) -> ReliftCertificate:
     """Certify an observer at run time, with any lifting of bounded slopes and any correction.
 

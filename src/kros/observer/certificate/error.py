@@ -131,10 +131,7 @@ class ErrorSystem:
 
 
 def error_system(
-    observer: ObserverData,
-    scales: ReliftScales | None = None,
-    box: Box | None = None,
-    parameters: Box | None = None,
+    observer: ObserverData, scales: ReliftScales | None = None, box: Box | None = None, parameters: Box | None = None
 ) -> ErrorSystem:
     """Return the error dynamics of an observer at run time, its delay included."""
     return _Assembly(observer, scales or ReliftScales.ones(observer), box, parameters).system()

@@ -18,12 +18,7 @@ from .field import FieldRecordings, status_counts
 
 
 def estimate_recordings(
-    run: Path,
-    data: Path,
-    out: Path,
-    given: Collection[str] = (),
-    track: str | None = None,
-    plot: Path | None = None,
+    run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None, plot: Path | None = None
 ) -> list[str]:
     """Write what `facts_of` names for every sample, and a plot of the first episode; return what people read.
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from ...core import ConfigError, IdentificationError, KrosError, Progress, Record, load_artifact, save_artifact
 from ...data import OUTLIERS, Population, split_episodes
-from ...design.task import is_robust
 from ...evaluate.held_out import HeldOut, Outcome
 from ...evaluate.next_unit import fewest_units, next_unit_bound
 from ...identify.identified import recordings_of, recordings_path
@@ -196,7 +195,7 @@ def facts_of_folds(folds: Sequence[dict[str, Record]]) -> dict[str, Record]:
             "made": len(designed),
             "orders": sorted({e["order"] for e in observers}),
             "relift_certified": sum(bool(e["relift_certified"]) for e in observers) if observers else None,
-            "robust": sum(is_robust(e) for e in observers) if observers else None,
+            "robust": sum(e.get("worst_case_h2") is not None for e in observers) if observers else None,
             "reasons": sorted({str(e[key]) for e in entries for key in ("reason", "relift_reason") if e.get(key)}),
         }
     return facts

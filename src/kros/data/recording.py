@@ -144,9 +144,10 @@ def check_increasing(recording: Recording, where: str = "") -> None:
     bad = np.flatnonzero(~(np.diff(time) > 0))
     if bad.size:
         k = int(bad[0])
-        actual = f"found {time[k]:g} s at sample {k} and {time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps)"
-        advice = "remove repeated or disordered samples"
-        raise DataError(f"{title(recording.key)}{where}: time should increase, {actual}; {advice}.")
+        raise DataError(
+            f"{title(recording.key)}{where}: time should increase, found {time[k]:g} s at sample {k} and "
+            f"{time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps); remove repeated or disordered samples."
+        )
 
 
 def check_even(recording: Recording, period_s: float, reference: EpisodeKey, where: str = "") -> None:

@@ -194,9 +194,10 @@ class Offset(Step):
         """Return the recording with the offset removed."""
         columns = self.columns((self.channel, self.reference), channels)
         if len(recording.values) < self.stop:
-            needs = f"the offset of {self.channel!r} is calibrated over samples {self.start}-{self.stop - 1}"
-            actual = f"the episode has {len(recording.values)}"
-            raise DataError(f"{title(recording.key)}: {needs}, {actual}; leave the episode out.")
+            raise DataError(
+                f"{title(recording.key)}: the offset of {self.channel!r} is calibrated over samples "
+                f"{self.start}-{self.stop - 1}, the episode has {len(recording.values)}; leave the episode out."
+            )
         window = recording.values[self.start : self.stop, columns]
         check_finite(window, recording.key, [channels[i] for i in columns], first=self.start)
         values = recording.values.copy()
@@ -224,9 +225,10 @@ class Trim(Step):
         n = len(recording.values)
         stop = min(n if self.stop is None else self.stop, n - self.tail)
         if stop <= self.start:
-            bounds = f"start = {self.start}, stop = {self.stop}, tail = {self.tail}"
-            advice = "leave the episode out or trim less"
-            raise DataError(f"{title(recording.key)}: trimming to {bounds} leaves nothing of {n} samples; {advice}.")
+            raise DataError(
+                f"{title(recording.key)}: trimming to start = {self.start}, stop = {self.stop}, tail = {self.tail} "
+                f"leaves nothing of {n} samples; leave the episode out or trim less."
+            )
         return recording.cut(self.start, stop)
 
 

@@ -110,8 +110,10 @@ def make_difference(training: TrainingSet, measured: Columns) -> Baseline:
     y, period = batch.measurements(measured), population.sample_period_s
     pairs = followed(batch, measured)
     if not pairs:
-        problem = f"no state of {', '.join(population.states)} follows the rate of a measured one"
-        raise ConfigError(f"Filtered difference: {problem}; record the rate.")
+        raise ConfigError(
+            f"Filtered difference: no state of {', '.join(population.states)} follows the rate of a measured one; "
+            "record the rate."
+        )
     estimated = tuple(state for _, state in pairs)
     plain = (FilteredDifference(len(population.states), pairs, float(cutoff), period) for cutoff in cutoffs_hz(period))
     trials = [trial.scaled_to(batch, measured) for trial in plain]
@@ -190,8 +192,10 @@ def make_mean_profile(
     means = unit_means(training, list(motions.values()), estimated, same)
     for key, of_units in zip(motions, means, strict=True):
         if len(of_units) < 2:
-            reason = f"the inputs of held-out {key} do not occur in training episodes of two units"
-            raise DataError(f"Mean profile: {reason}; they may differ by {100 * same:g} % of the largest (RMS).")
+            raise DataError(
+                f"Mean profile: the inputs of held-out {key} do not occur in training episodes of two units; they may "
+                f"differ by {100 * same:g} % of the largest (RMS)."
+            )
 
     def without(left_out: str) -> MeanProfile:
         states = [np.mean([p for unit, p in of_units.items() if unit != left_out], axis=0) for of_units in means]

@@ -240,8 +240,10 @@ def require_useful(problem: ObserverProblem, observer: Observer, bound: float) -
     nothing = gain(np.zeros((problem.nominal.n_outputs, columns)), problem.nominal.dt)
     without = certify_errors(problem, problem.estimate_error(nothing), np.zeros(1))[0]
     if bound >= without:
-        both = f"the bound over the set is {bound:.3g}, and without an estimate {without:.3g}"
-        raise SynthesisError(f"{both}: the inputs of the set are independent, recorded ones are not.")
+        raise SynthesisError(
+            f"the bound over the set is {bound:.3g}, and without an estimate {without:.3g}: the inputs of the set are "
+            "independent, recorded ones are not."
+        )
 
 
 def error_maps(task: DesignTask, design: Design, problem: ObserverProblem) -> tuple[StateSpace, Array]:

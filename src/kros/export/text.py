@@ -41,8 +41,10 @@ def plain_names(names: Iterable[str]) -> list[str]:
     names = list(names)
     shown = [plain(name) for name in names]
     if len(set(shown)) < len(names):
-        problem = f"Export: the names {', '.join(map(repr, names))} cannot be told apart in generated code"
-        raise ConfigError(f"{problem}; rename channels by letters and digits.")
+        raise ConfigError(
+            f"Export: the names {', '.join(map(repr, names))} cannot be told apart in generated code; rename channels "
+            "by letters and digits."
+        )
     return shown
 
 

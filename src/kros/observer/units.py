@@ -13,11 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..core.arrays import Array
-from ..core.errors import DataError
-from ..core.files import shortened
-from ..core.lti import StateSpace
-from ..core.rounding import ROUNDING, TINY
+from ..core import ROUNDING, TINY, Array, DataError, StateSpace, shortened
 from ..data.measures import unit_of_factor
 from ..synthesis.result import Injection
 from .data import ObserverData

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core import AnyArray
 from .canvas import grid, legend, thin
-from .files import to_png
+from .files import printed
 from .theme import DRAWING, Tone, style
 
 
@@ -27,4 +27,4 @@ def estimates_png(period_s: float, columns: Mapping[str, AnyArray], units: Mappi
             panel.set_ylabel(f"{name} [{unit}]" if unit else name)
         panels[-1, 0].set_xlabel("time [s]")
         legend(figure, panels[0, 0])
-    return to_png(figure)
+    return printed(figure, "png")

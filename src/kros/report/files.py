@@ -20,6 +20,7 @@ from .theme import DRAWING, Tone, style
 
 log = logging.getLogger(__name__)
 
+_CHANGING = {"png": ["Software"], "pdf": ["CreationDate", "Creator", "Producer"]}  # what no file states
 _FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 _FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?DejaVu Sans'?(?:, [^;\"]*)?")
 _COORDINATES = re.compile(r'(?<= )(?:d|x|y|transform)="[^"]*"')
@@ -37,22 +38,16 @@ def write_figures(run: Path, out: Path, progress: Progress | None = None) -> lis
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)
             continue
-        for suffix, encode in (("png", to_png), ("pdf", to_pdf)):
-            write_bytes(out / f"{drawn.name}.{suffix}", encode(drawn.figure))
+        for suffix in _CHANGING:
+            write_bytes(out / f"{drawn.name}.{suffix}", printed(drawn.figure, suffix))
             names.append(f"{drawn.name}.{suffix}")
     progress.finish("figures", time.perf_counter() - began, skipped=False)
     return names
 
 
-def to_png(figure: Figure) -> bytes:
-    """Return a figure as PNG, 200 dots an inch."""
-    return _encode(figure, "png", dpi=DRAWING.dots_per_inch, metadata={"Software": None})
-
-
-def to_pdf(figure: Figure) -> bytes:
-    """Return a figure as PDF; the same content gives the same bytes."""
-    metadata = dict.fromkeys(("CreationDate", "Creator", "Producer"))
-    return _encode(figure, "pdf", dpi=DRAWING.dots_per_inch, metadata=metadata)
+def printed(figure: Figure, kind: str) -> bytes:
+    """Return a figure as PNG or PDF, 200 dots an inch; the same content gives the same bytes."""
+    return _encode(figure, kind, dpi=DRAWING.dots_per_inch, metadata=dict.fromkeys(_CHANGING[kind]))
 
 
 def to_svg(figure: Figure, name: str) -> str:

@@ -66,10 +66,10 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    absent: Record = {"head": None, "evidence": (), "figures": {}}
+    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": Markup(stylesheet())}
     script = Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8"))
-    look: Record = {"style": Markup(stylesheet()), "script": script, "head": None, "evidence": (), "figures": {}}
-    template = environment.get_template("report.html.jinja")
-    return template.render(look | parts, name=name, subtitle=subtitle, sections=sections)
+    return environment.get_template("report.html.jinja").render(absent | parts, script=script)
 
 
 def encoded(run: RunFolder, name: str) -> Encoded:

@@ -60,9 +60,10 @@ def discover(source: Path, wanted: Wanted | None = None, work: Work | None = Non
     head, alike, strange = _alike(_files(source, wanted.files))
     names = infer_names(list(alike))
     if wanted.files is None and names.other is not None:
-        choice = f"--files '{names.other}' or --files '{names.pattern}'"
-        two = f"{some(list(alike), 3)} can be episodes of one unit or units with one recording each"
-        raise ConfigError(f"Names of files: {two}; choose, {choice}.")
+        raise ConfigError(
+            f"Names of files: {some(list(alike), 3)} can be episodes of one unit or units with one recording each; "
+            f"choose, --files '{names.other}' or --files '{names.pattern}'."
+        )
     mapping: Record = {"files": wanted.files or names.pattern}
     mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
     columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)

@@ -131,9 +131,10 @@ class CsvMapping(Settings):
             actual = f"time = {self.time!r}, sample_period_s = {self.sample_period_s!r}"
             raise ValueError(f"give one of time and sample_period_s, found {actual}")
         if not (_is_mark(self.delimiter) and _is_mark(self.decimal)) or self.delimiter == self.decimal:
-            wanted = "two different characters of ASCII that stand in no number otherwise"
-            actual = f"delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
-            raise ValueError(f"delimiter and decimal should be {wanted}, found {actual}")
+            raise ValueError(
+                "delimiter and decimal should be two different characters of ASCII that stand in no number otherwise, "
+                f"found delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
+            )
         names = [c.name for c in self.channel]
         if not names:
             raise ValueError("there is no [[channel]]; declare each channel with name, column and role")

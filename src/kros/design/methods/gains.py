@@ -101,8 +101,9 @@ class ResidualH2(Method):
         tried = residual_models(*nominal, task.training.read(), task.noise, scale)
         models = [model for model in tried if np.isfinite(model.promised).all()][: self.compared]
         if not models:
-            problem = "no model promises bounded errors; check what is measured and the recordings"
-            raise SynthesisError(f"Residual-shaped observer: {problem}.")
+            raise SynthesisError(
+                "Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings."
+            )
         problems = [ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
         lifted, order = given.lifting.n_lifted, self.max_order
         syntheses = [residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]

@@ -71,14 +71,18 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_uni
             return watched
         check_channels(population, observer)
     if not names:
-        advice = "run the study until quantify, with at least three units"
-        raise ConfigError(f"Run {store.folder}: has no outlier scores to compare with; {advice}.")
+        raise ConfigError(
+            f"Run {store.folder}: has no outlier scores to compare with; run the study until quantify, with at least "
+            "three units."
+        )
     sets = {name: ModelSet.load(store.path("models", name)) for name in names}
     known = {name: models for name, models in sets.items() if models.condition in population.conditions}
     if not known:
         modelled, there = (", ".join(c) for c in ([m.condition for m in sets.values()], population.conditions))
-        both = f"the recordings have the conditions {there}, and the run has models of {modelled} alone"
-        raise DataError(f"Checking {data}: {both}; name the condition, as in the study.")
+        raise DataError(
+            f"Checking {data}: the recordings have the conditions {there}, and the run has models of {modelled} alone; "
+            "name the condition, as in the study."
+        )
     levels = {(r["unit"], r["condition"]): {k: r[k] for k in r if k.startswith("level_")} for r in watched}
     rows: Rows = []
     with open_executor(workers) as executor:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ...core import ConfigError, load_artifact, write_bytes
+from ...core import ConfigError, Record, load_artifact, write_bytes
 from ...export.estimates import ENDINGS, writer
 from ...observer.units import recorded_channel, recorded_factors
 from ..config import Stage
@@ -63,7 +62,7 @@ def unit_lines(sources: Mapping[str, str], counts: Mapping[str, Mapping[str, int
     return lines
 
 
-def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
+def facts_of(recordings: FieldRecordings) -> Record:
     """Return the observer, columns with their units of measure, and parameters of every unit with their sources."""
     observer, name = recordings.observer, recordings.name
     columns = {c.name: recorded_channel(observer, c.name).unit for c in recordings.population.channels}

@@ -7,9 +7,8 @@ import shutil
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
-from ...core import ConfigError, load_artifact, write_bytes
+from ...core import ConfigError, Record, load_artifact, write_bytes
 from ...loops.compiler import COMPILERS
 from ...report.compare import comparison, lines, sections
 from ...report.content import Column, Section, build
@@ -77,7 +76,7 @@ def list_run(run: Path) -> list[str]:
         return [*lines, "the run has not ended; the same command of kros run goes on with it"]
 
 
-def compare_runs(runs: Sequence[Path], out: Path | None) -> tuple[dict[str, Any], list[str]]:
+def compare_runs(runs: Sequence[Path], out: Path | None) -> tuple[Record, list[str]]:
     """Return finished runs beside each other, as content of JSON and as lines; written as a page to `out`."""
     if len(set(runs)) < 2:
         raise ConfigError(f"Compare: at least two runs are needed, found {len(set(runs))}; name another run folder.")

@@ -10,9 +10,8 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-from ...core import ConfigError, KrosError, digest_of, write_json
+from ...core import ConfigError, KrosError, Record, digest_of, write_json
 from ...core.files import draft_beside, is_file, link_or_copy, stamp_of
 from ...data.readers.parquet import INDEX
 from ...report.unit_verdicts import worst
@@ -63,7 +62,7 @@ def place_of(path: Path, changing: Path, folder: Path, out: Path) -> Path:
 
 def judged(config: StudyConfig, store: Store, path: Path, place: Path, folder: Path, out: Path) -> Iterator[str]:
     """Check one recording, alone in a folder like its own, and write its result; yield its line, none if it changed."""
-    name, result = str(path.relative_to(folder)), dict[str, Any]()
+    name, result = str(path.relative_to(folder)), Record()
     with draft_beside(out) as draft:
         try:
             if path.is_file():

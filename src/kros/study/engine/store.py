@@ -145,8 +145,10 @@ class Store:
             link_or_copy(source, beside)
             beside.replace(target)
         except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            obstacle = f"{error.filename2 or error.filename} is in the place of a result"
-            raise ConfigError(f"Run folder {self.folder}: {obstacle}; move it away.") from error
+            raise ConfigError(
+                f"Run folder {self.folder}: {error.filename2 or error.filename} is in the place of a result; move it "
+                "away."
+            ) from error
 
     def drop(self, *stages: str) -> None:
         """Forget stages and their files in the run folder that are as written; artefacts stay."""
@@ -229,8 +231,10 @@ def require_own(out: Path, config: StudyConfig) -> bool:
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
     there, this = _identity(_read_study(out)), _identity(config.dump())
     if there != this:
-        both = f"holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}"
-        raise ConfigError(f"Output {out}: {both}; name another folder, or remove this one if it is not needed.")
+        raise ConfigError(
+            f"Output {out}: holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}; name "
+            "another folder, or remove this one if it is not needed."
+        )
     return False
 
 

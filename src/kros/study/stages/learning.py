@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from shutil import copyfile
 
-from ...core import ConfigError, DataError, save_artifact
+from ...core import ConfigError, DataError, Names, save_artifact
 from ...data import OUTLIERS, Population, read
 from ...data.prepare import parse_steps, prepare
 from ...design.synthesize import synthesize_all
@@ -44,14 +44,16 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
     return population.select([u for u in population.unit_ids if u not in data.exclude])
 
 
-def draw(config: StudyConfig, population: Population) -> tuple[str, ...]:
+def draw(config: StudyConfig, population: Population) -> Names:
     """Return the units in reserve, drawn from those that the study does not name, by their places alone."""
     n, named = config.evaluate.reserve, set(config.load.units)
     pooled = [u.id for u in population.units if u.group != OUTLIERS]
     free = [u for u in pooled if u not in named]
     if n and (n > len(free) or len(pooled) - n < FEWEST):
-        there = f"there are {len(pooled)} units, {len(pooled) - len(free)} named by the study"
-        raise ConfigError(f"evaluate.reserve = {n}: {there}, and a population needs {FEWEST}; reserve fewer.")
+        raise ConfigError(
+            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} named by the study, and "
+            f"a population needs {FEWEST}; reserve fewer."
+        )
     return draw_reserve(free, n)
 
 

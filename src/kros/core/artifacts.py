@@ -191,7 +191,7 @@ class Storable:
 
 def divided(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
     """Return a value in JSON's types, numbers that JSON has not as texts, and its arrays by where they are in it."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays = dict[str, np.ndarray]()
 
     def plain_of(part: Any, name: str) -> Any:
         if isinstance(part, np.ndarray):

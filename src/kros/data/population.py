@@ -299,7 +299,7 @@ class Population(Shown):
     @cached_property
     def _positions(self) -> dict[tuple[str, str], list[int]]:
         """Positions of the episodes of each unit and condition."""
-        positions: dict[tuple[str, str], list[int]] = {}
+        positions = dict[tuple[str, str], list[int]]()
         for i, key in enumerate(self.episodes):
             positions.setdefault((key.unit, key.condition), []).append(i)
         return positions

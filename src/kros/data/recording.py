@@ -374,7 +374,7 @@ def digest_of(values: Array) -> str:
 
 def copies_among(digests: Iterable[tuple[EpisodeKey, str]]) -> Iterator[tuple[EpisodeKey, EpisodeKey]]:
     """Yield the episodes that are copies of earlier ones, with these."""
-    first: dict[str, EpisodeKey] = {}
+    first = dict[str, EpisodeKey]()
     for key, digest in digests:
         if first.setdefault(digest, key) != key:
             yield key, first[digest]

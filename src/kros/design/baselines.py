@@ -64,7 +64,7 @@ class Baseline:
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Mapping[str, Array]) -> Array:
         """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
-        units: dict[str, list[int]] = {}
+        units = dict[str, list[int]]()
         for i, key in enumerate(keys):
             units.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
         samples, parts = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), list[Array]()
@@ -208,7 +208,7 @@ def make_mean_profile(
 
 def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:
     """Return the inputs of episodes that differ, (n_samples, m) each."""
-    motions: dict[EpisodeKey, Array] = {}
+    motions = dict[EpisodeKey, Array]()
     for key in keys:
         u = population.read_parts(key)[1]
         sizes = largest_of([*motions.values(), u])

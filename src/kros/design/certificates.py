@@ -72,7 +72,7 @@ def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
 def certified_on(task: DesignTask) -> list[EpisodeBatch]:
     """Return the starts of the first episodes of units, all of short ones, and the same of other conditions."""
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
-    others: dict[str, list[EpisodeKey]] = {}
+    others = dict[str, list[EpisodeKey]]()
     for key in (k for k in task.recordings.keys if k.condition not in home and k.unit in units):
         others.setdefault(key.condition, []).append(key)
     batches = []

@@ -121,7 +121,7 @@ def steady(largest: Mapping[Group, Array], settings: MonitorSettings) -> Array:
     """Return weights of levels, shape (q, bands), whose mean differs least from unit to unit of a condition."""
     from scipy.optimize import nnls
 
-    by_condition: dict[str, list[Array]] = {}
+    by_condition = dict[str, list[Array]]()
     for (_, condition), levels in largest.items():
         by_condition.setdefault(condition, []).append(levels.ravel())
     apart = np.concatenate([np.array(levels) - np.mean(levels, axis=0) for levels in by_condition.values()])

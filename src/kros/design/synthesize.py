@@ -220,7 +220,7 @@ def certified(
 ) -> dict[str, Design]:
     """Certify observers as nonlinear ones, a lifting side by side, and on the set with disturbances a method chose."""
     pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
-    groups: dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]] = {}
+    groups = dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]]()
     for task, design in pairs:
         groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]

@@ -58,7 +58,7 @@ class TrainingSet:
         """Take all training episodes of pooled units, one of every unit and condition before the second of any."""
         facts = identified.facts
         parameters = {u: identified.parameters[u] for u in facts.pooled if u in models.unit_ids}
-        groups: dict[tuple[str, str], list[EpisodeKey]] = {}
+        groups = dict[tuple[str, str], list[EpisodeKey]]()
         for key in (key for unit in parameters for key in facts.keys("train", unit)):
             groups.setdefault((key.unit, key.condition), []).append(key)
         keys = tuple(k for turn in zip_longest(*groups.values()) for k in turn if k is not None)

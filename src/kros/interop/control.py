@@ -101,7 +101,7 @@ def from_control(system: Any) -> StateSpace:
     >>> from_control(control.tf([1.0], [1.0, -0.5], 0.01)).A.tolist()
     [[0.5]]
     """
-    if not isinstance(system, (control.StateSpace, control.TransferFunction)):
+    if not isinstance(system, control.StateSpace | control.TransferFunction):
         raise DimensionError(
             f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}."
         )

@@ -56,7 +56,7 @@ def from_pykoop(
         ) from error
     widths = {x.shape[1] if x.ndim == 2 else 0 for x in arrays.values()}
     n_states = min(widths, default=0) - 1 - n_inputs
-    if len(widths) != 1 or not isinstance(n_inputs, (int, np.integer)) or n_inputs < 0 or n_states < 1:
+    if len(widths) != 1 or not isinstance(n_inputs, int | np.integer) or n_inputs < 0 or n_states < 1:
         raise DataError(
             f"from_pykoop: needs arrays (n_samples, 1 + states + {n_inputs}) of one width, found widths "
             f"{sorted(widths)}; check n_inputs."
@@ -64,7 +64,7 @@ def from_pykoop(
     if channels is None:
         states = [Channel(f"x{i}", Role.STATE, measured=True) for i in range(n_states)]
         channels = [*states, *(Channel(f"u{i}", Role.INPUT) for i in range(n_inputs))]
-    episodes: dict[EpisodeKey, Array] = {}
+    episodes = dict[EpisodeKey, Array]()
     for unit, x in arrays.items():
         ids = x[:, 0]
         bad = np.flatnonzero((ids % 1 != 0) | (np.abs(ids) >= 2.0**53))

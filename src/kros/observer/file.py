@@ -65,7 +65,7 @@ class _Controller(_Model):
 def _part(kind: Any) -> Any:
     """Return what the file holds of a part whose fields are numbers, arrays of them, or numbers by name."""
     types: Record = {"Array": Row | Matrix, "Array | None": Limits, "float": float, "int": int}
-    held: Record = {}
+    held = Record()
     for f in fields(kind):
         needed = f.default is MISSING and f.default_factory is MISSING
         held[f.name] = (types[str(f.type)], ...) if needed else (types[str(f.type)] | None, None)

@@ -108,7 +108,7 @@ def recorded_factors(observer: ObserverData, names: Sequence[str]) -> Array:
 
 def _factor(observer: ObserverData, name: str, value: Any) -> float:
     """Return a factor that a number of the file can be."""
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not abs(value) < 1 / TINY or not abs(value) > TINY:
         raise DataError(
             f"Observer {observer.name}: the factor of {name!r} should be a finite number other than zero, found "

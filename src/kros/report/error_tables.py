@@ -62,7 +62,7 @@ def tables_of(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None 
     """Return rows of errors by condition, observer and channel."""
     tables, known = [], intervals or {}
     for condition in sorted({r["condition"] for r in rows}, key=lambda c: (c != identify_on, natural_key(c))):
-        grouped: dict[str, dict[str, list[ByName]]] = {}
+        grouped = dict[str, dict[str, list[ByName]]]()
         for row in (r for r in rows if r["condition"] == condition):
             grouped.setdefault(row["observer"], {}).setdefault(row["channel"], []).append(row)
         cells = {

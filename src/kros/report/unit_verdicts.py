@@ -46,7 +46,7 @@ def with_verdict(row: Record) -> Record:
 
 def by_unit(rows: Sequence[Record]) -> dict[str, tuple[Verdict, list[str]]]:
     """Return the verdict on every unit, and the reason of every condition."""
-    units: dict[str, list[Record]] = {}
+    units = dict[str, list[Record]]()
     for row in rows:
         units.setdefault(row["unit"], []).append(row)
     return {u: (worst(of), [f"{row['condition']}: {row['reason']}" for row in of]) for u, of in units.items()}

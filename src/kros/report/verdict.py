@@ -238,7 +238,7 @@ def undecided(rows: Sequence[ByName]) -> list[ByName]:
 
 def units_text(rows: Sequence[ByName]) -> str:
     """Return units with their conditions, for a sentence."""
-    units: dict[str, list[str]] = {}
+    units = dict[str, list[str]]()
     for row in rows:
         units.setdefault(row["unit"], []).append(condition_label(row["condition"]))
     named = {unit: ", ".join(filter(None, conditions)) for unit, conditions in units.items()}

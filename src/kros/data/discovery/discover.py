@@ -143,7 +143,7 @@ def _columns(
 
 def _described(head: TableHead) -> list[TableColumn]:
     """Return the columns by their headers, without parts."""
-    described: list[TableColumn] = []
+    described = list[TableColumn]()
     for i, (header, unit) in enumerate(zip(head.fields, head.units, strict=True)):
         column = describe(header or f"column {i + 1}", unit, [c.name for c in described])
         if not head.dialect.header or head.fields.count(header) > 1:

@@ -139,7 +139,7 @@ def time_scale(column: TableColumn, step: float) -> tuple[float, str]:
 
 def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[TableColumn]:
     """Return the columns with the part that each is likely to have; time is known already."""
-    proposed: list[TableColumn] = []
+    proposed = list[TableColumn]()
     for i, column in enumerate(columns):
         part, why = column.part, column.why
         if part is not ColumnPart.TIME:

@@ -50,7 +50,7 @@ def _value(value: Any) -> str:
     if isinstance(value, str):
         literal = "\\" in value and "'" not in value and value.isprintable()
         return f"'{value}'" if literal else json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, (list, tuple)):
+    if isinstance(value, list | tuple):
         return f"[{', '.join(_value(v) for v in value)}]"
     return repr(value)
 

@@ -291,8 +291,8 @@ def read_csv_folder(
 ) -> Population:
     """Read a folder of CSV files, also gzip-compressed."""
     chosen, source = load_mapping(mapping), Path(source)
-    places: dict[EpisodeKey, FilePlace] = {}
-    groups: dict[str, str] = {}
+    places = dict[EpisodeKey, FilePlace]()
+    groups = dict[str, str]()
     for path, match in _matches(source, chosen):
         fields, stated = file_fields(path, chosen.dialect, chosen.declared)
         if optional and not places:

@@ -80,7 +80,7 @@ def _bag(path: Path) -> Iterator[Group]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    rows: dict[str, list[Record]] = {}
+    rows = dict[str, list[Record]]()
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
         for connection, stamp, raw in reader.messages():
             numbers = {"time": 1e-9 * (stamp - reader.start_time)}
@@ -146,7 +146,7 @@ def _tables(path: Path, version: tuple[int, int]) -> list[dict[str, tuple[Array,
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # asammdf fails to delete what it could not open
     try:
         for values, units in read(path):
-            by_length: dict[int, dict[str, tuple[Array, str]]] = {}
+            by_length = dict[int, dict[str, tuple[Array, str]]]()
             for name, signal in _signals("", values):
                 if signal.size > 1:
                     by_length.setdefault(len(signal), {})[name] = signal.astype(float), units.get(name, "")

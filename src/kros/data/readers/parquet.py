@@ -184,7 +184,7 @@ class _Index:
 
 def _places(groups: Iterable[GroupRecord]) -> dict[EpisodeKey, Place]:
     """Return where every episode is."""
-    places: dict[EpisodeKey, Place] = {}
+    places = dict[EpisodeKey, Place]()
     for g in groups:
         if g.file in ("", ".", "..") or Path(g.file).name != g.file:
             raise ValueError(f"the file {g.file!r} is not beside the index")

@@ -120,7 +120,7 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
     every += [(name, "input", "input {}", "0.0") for name in observer.inputs]
     every += [(name, "parameter", "this machine's {}", start) for name, start in of_parameters.items()]
     outputs = [(name, "output", "estimate of {} at the end of the step", None) for name in estimates]
-    rows: list[Record] = []
+    rows = list[Record]()
     for index, (name, causality, text, start) in enumerate([*every, *outputs, ("status", "output", bits, None)]):
         shown = plain(name)
         row = {"name": f"{shown}_hat" if text.startswith("estimate") else shown, "causality": causality, "start": start}

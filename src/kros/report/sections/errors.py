@@ -116,7 +116,7 @@ def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
         ("as published", next(iter(published(table.cells)), None)),
         *(("", name) for name in (best(tuned), "learned", "filtered_difference", f"{facts.model}/open_loop")),
     ]
-    roles: dict[str, list[str]] = {}
+    roles = dict[str, list[str]]()
     for role, name in chosen:
         if name in table.cells:
             roles.setdefault(str(name), []).extend([role] if role else [])

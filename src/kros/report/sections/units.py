@@ -48,7 +48,7 @@ def units(facts: Facts) -> Section | None:
 
 def _first(rows: Sequence[ByName], errors: Mapping[tuple[str, str], ByName], flagged: set[str]) -> list[ByName]:
     """Return flagged units, then those with the largest errors; of very many units the first ones."""
-    largest: dict[str, float] = {}
+    largest = dict[str, float]()
     for (unit, _), row in errors.items():
         error = math.inf if row["error_percent"] is None else row["error_percent"]
         largest[unit] = max(largest.get(unit, 0.0), error)

@@ -79,7 +79,7 @@ def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome | st
 
 def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:
     """Do the work; return outcomes by name, observers of the study first, in its order."""
-    by_name: dict[str, Outcome | str] = {}
+    by_name = dict[str, Outcome | str]()
     for names, result in zip(work, context.work.run("evaluate", work.values()), strict=True):
         by_name |= dict(zip(names, result if isinstance(result, list) else [result], strict=True))
     return {name: by_name[name] for name in dict.fromkeys((*context.observers_record["names"], *by_name))}
@@ -90,7 +90,7 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     identified, sensor = context.identified, context.config.sensor
     first = identified.models()
     training, whole = TrainingSet.of(identified, first, sensor), TrainingSet.whole(identified, first, sensor)
-    makers: dict[str, Callable[[], Baseline]] = {}
+    makers = dict[str, Callable[[], Baseline]]()
     if first.lifting.functions or first.lifting.input_functions:
         noise = measurement_noise(identified, first, sensor)
         makers[f"{first.name}/ekf"] = partial(make_extended, training, first, context.uncertain.nominal, noise)
@@ -154,7 +154,7 @@ def _arrays(
     episodes: HeldOut, estimates: Mapping[str, Outcome], free_runs: Mapping[str, Outcome]
 ) -> dict[str, AnyArray]:
     """Collect the trajectories that figures need, in single precision."""
-    arrays: dict[str, Array] = {}
+    arrays = dict[str, Array]()
     for number, i in enumerate(episodes.shown):
         start = f"shown{number}"
         arrays[f"{start}/states"], arrays[f"{start}/inputs"] = episodes.population.read_parts(episodes.keys[i])

@@ -148,7 +148,7 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
     facts = replace(facts, groups=dict.fromkeys(facts.reserve, ""), train=train, test=test, reserve=())
     known: Values = {}
-    failed: dict[str, str] = {}
+    failed = dict[str, str]()
     for unit in facts.groups:
         try:
             known |= unit_parameters(whole.select([unit]), context.calibration, facts.identify_on, facts)

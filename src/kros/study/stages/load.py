@@ -54,8 +54,8 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     makers = {f"{kind}/{LOAD}": partial(_with_load, context, trial, kind, lifting) for kind, lifting in trial.liftings}
     names = [f"{kind}/{TRIAL.unaware}" for kind, _ in trial.liftings]
     makers |= {f"{n}/current": partial(_from_current, trial, observers[n]) for n in names if n in observers}
-    curves: dict[str, Array] = {}
-    facts: dict[str, Record] = {}
+    curves = dict[str, Array]()
+    facts = dict[str, Record]()
     for name, make in makers.items():
         try:
             curves[name], fact = make()

@@ -38,14 +38,6 @@ def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, AnyArray]:
     return figure, panels
 
 
-def settle(figure: Figure) -> None:
-    """Lay a figure out once; otherwise every file written from it would do so again."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-        figure.set_layout_engine(None)
-
-
 def engineering(axis: Axis) -> None:
     """Number a linear axis with SI prefixes below 0.001 and from 1000 on, without a factor in the corner."""
     from matplotlib.ticker import FuncFormatter

@@ -11,7 +11,6 @@ from .facts import Facts
 from .names import number
 from .verdict import judge
 
-Rows = Record  # values by what they are of
 _WORDS = ("settings", "data", "deployed")  # topics whose values are texts
 TITLES = {
     "settings": "Settings that differ",
@@ -37,7 +36,7 @@ def comparison(runs: Mapping[str, tuple[ByName, Facts]]) -> dict[str, dict[str, 
     return {"settings": compared, **{topic.__name__: side_by_side([topic(of) for of in facts]) for topic in topics}}
 
 
-def side_by_side(of_runs: Sequence[Rows]) -> dict[str, list[Any]]:
+def side_by_side(of_runs: Sequence[Record]) -> dict[str, list[Any]]:
     """Return a value of every run by name, without names that no run knows."""
     names = dict.fromkeys(name for rows in of_runs for name, value in rows.items() if value not in (None, ""))
     return {name: [rows.get(name) for rows in of_runs] for name in names}
@@ -76,14 +75,14 @@ def text(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-def data(facts: Facts) -> Rows:
+def data(facts: Facts) -> Record:
     """Return what was recorded."""
     aside = sum(row.get("group") == "outliers" for row in facts.get("units", ()))
     study = {name: value for name, value in facts.study.items() if name not in ("deployed", "alerts")}
     return dict(flat(study | {"units_set_aside": aside}))
 
 
-def deployed(facts: Facts) -> Rows:
+def deployed(facts: Facts) -> Record:
     """Return which observer is deployed, and what is said of it."""
     verdict = judge(facts)
     return {
@@ -96,9 +95,9 @@ def deployed(facts: Facts) -> Rows:
     }
 
 
-def errors(facts: Facts) -> Rows:
+def errors(facts: Facts) -> Record:
     """Return mean and worst errors of all observers in the channels that are not measured."""
-    rows: Rows = {}
+    rows = Record()
     for table in facts.tables:
         where = f", {table.condition}" if len(facts.tables) > 1 else ""
         for name, cells in table.cells.items():
@@ -108,9 +107,9 @@ def errors(facts: Facts) -> Rows:
     return rows
 
 
-def weights(facts: Facts) -> Rows:
+def weights(facts: Facts) -> Record:
     """Return form, nominal and weights of every kind of model."""
-    rows: Rows = {}
+    rows = Record()
     for kind, found in facts.get("uncertainty", {}).items():
         weight = found.get("weight", {})
         rows |= {
@@ -125,9 +124,9 @@ def weights(facts: Facts) -> Rows:
     return rows | ({"units flagged": text(flagged) or "none"} if rows else {})
 
 
-def certificates(facts: Facts) -> Rows:
+def certificates(facts: Facts) -> Record:
     """Return bounds over the set of plants, worst-case H2 and gains at run time of all observers."""
-    rows: Rows = {}
+    rows = Record()
     for name, entry in facts.observers.items():
         bounds = entry.get("set_bound_percent") or {}
         rows |= {f"{name}: {c}": bound for c, bound in bounds.items() if c not in facts.measured}

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from ..core import ConfigError, Progress, write_bytes
-from .canvas import Figure, settle
+from .canvas import Figure
 from .figures import FIGURES, draw_all
 from .run_folder import RunFolder
 from .theme import DRAWING, Tone, style
@@ -85,6 +85,8 @@ def _named_units(text: str) -> str:
 def _encode(figure: Figure, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     with style():
-        settle(figure)
+        if (engine := figure.get_layout_engine()) is not None:  # once: every file would lay it out again
+            engine.execute(figure)
+            figure.set_layout_engine(None)
         figure.savefig(buffer, format=kind, **options)
     return buffer.getvalue()

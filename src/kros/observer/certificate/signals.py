@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core import AGREED, TINY, Array, Flags, Names, Parameters, Record, Whole, frozen
+from ...core import AGREED, TINY, Array, Flags, Names, Parameters, Record, frozen
 from ...data import EpisodeBatch
 from ...loops import recursion
 from ..data import ObserverData
@@ -88,7 +88,9 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
     member /= member.sum(axis=1, keepdims=True)
 
     def rms(signal: Array) -> Array:
-        return np.sqrt(member @ seen.mean_square(signal))
+        """Return the RMS of every channel over the episodes of every unit, shape (unit, k)."""
+        inside = np.where(batch.inside[: len(signal), :, None], signal, 0.0)
+        return np.sqrt(member @ (np.sum(inside**2, axis=0) / batch.lengths[:, None]))
 
     errors = rms(seen.error[..., :n] + seen.beyond)
     result = SignalBound(observer.recorded, units, np.full(errors.shape, np.inf), errors, sizes)
@@ -135,14 +137,8 @@ class Course:
     noise: Array  # (n_samples - 1, batch, q): what the sensor shows beside the recording, as it arrives
     first: Array  # (batch, n_window): first error, with the earlier ones that the lifting reads, which equal it
     error: Array  # (n_samples, batch, n)
-    lengths: Whole  # (batch,)
     refused: Flags  # (batch,): whether the observer refuses a sample
     beyond: Array  # (n_samples, batch, n_recorded): what recorded states are beyond declared limits, by noise
-
-    def mean_square(self, signal: Array) -> Array:
-        """Return the mean square of every channel over every episode, shape (batch, k)."""
-        inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
-        return np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None]
 
 
 def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
@@ -161,7 +157,7 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     noise[:late] = 0.0
     omega = held_residual(observer, states, inputs, values)
     first = first_error(observer, states[0] - observer.initial(samples.y[0], values))
-    return Course(omega, noise, first, states - estimates, batch.lengths, refused, batch.states - states)
+    return Course(omega, noise, first, states - estimates, refused, batch.states - states)
 
 
 def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Parameters) -> Array:

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from ...core import Array, Columns, ConfigError, Flags, KrosError, Names, Record, frozen, load_artifact, save_artifact
+from ...core import Array, Columns, ConfigError, KrosError, Names, Record, frozen, load_artifact, save_artifact
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
@@ -63,7 +63,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
             fact = {"status": "failed", "reason": str(error)}
             log.info("%s could not be computed: %s", name, error)
         facts |= {name: fact} if fact else {}
-    shown = int(np.flatnonzero(trial.loaded)[0])
+    shown = next(i for i, key in enumerate(trial.test.keys) if key.condition == TRIAL.condition)
     key, arrays = trial.test.keys[shown], {"truth": trial.truth[1]} | {f"estimate/{n}": v for n, v in curves.items()}
     content = {"known": trial.known, "rows": [trial.row(*item) for item in curves.items()], "observers": facts}
     content |= {"corner_hz": TRIAL.judged_hz, "settle_s": TRIAL.settle_s, "estimates": list(curves)}
@@ -153,11 +153,6 @@ class LoadTrial:
     def places(self) -> tuple[int, int]:
         """Places of angle and current among the states."""
         return self.states.index(TRIAL.angle), self.states.index(TRIAL.current)
-
-    @property
-    def loaded(self) -> Flags:
-        """Which test episodes have the load."""
-        return np.array([k.condition == TRIAL.condition for k in self.test.keys])
 
     def row(self, name: str, estimate: Array) -> Record:
         """Return errors of an estimate for the metrics."""

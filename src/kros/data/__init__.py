@@ -32,7 +32,7 @@ from .prepare import prepare
 from .readers.arrays import from_arrays, from_frame
 from .readers.opening import detect_reader, read
 from .readers.parquet import read_parquet, write_parquet
-from .recording import NonFiniteError, check_population, some
+from .recording import NonFiniteError, some
 from .shown import Shown
 
 __all__ = [

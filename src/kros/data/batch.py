@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..core import Array, DataError, Flags, Names, Record, Whole, frozen
-from .population import EpisodeKey, Population
+from .population import EpisodeKey, Keys, Population
 from .recording import some
 
 
@@ -45,7 +45,7 @@ class EpisodeBatch:
     ((4, 4, 1), [4, 3, 4, 3])
     """
 
-    keys: tuple[EpisodeKey, ...]
+    keys: Keys
     lengths: Whole
     states: Array
     inputs: Array

@@ -113,6 +113,9 @@ class EpisodeKey:
         return f"episode {self.episode} of unit {self.unit} ({self.condition})"
 
 
+Keys = tuple[EpisodeKey, ...]
+
+
 @cache
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that orders ``2`` before ``10``."""
@@ -154,8 +157,8 @@ def part_columns(columns: Iterable[Channel]) -> Record:
 class Split:
     """Training and test episodes, in natural order."""
 
-    train: tuple[EpisodeKey, ...]
-    test: tuple[EpisodeKey, ...]
+    train: Keys
+    test: Keys
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -194,7 +197,7 @@ class Population(Shown):
     channels: Channels
     sample_period_s: float
     units: tuple[Unit, ...]
-    episodes: tuple[EpisodeKey, ...]
+    episodes: Keys
     source: Any  # kros.data.prepare.PreparedSource
     metadata: ByName = field(default_factory=dict)
     truths: Channels = ()
@@ -255,7 +258,7 @@ class Population(Shown):
         known = ", ".join(self.unit_ids[:10]) + (" ..." if len(self.units) > 10 else "")
         raise DataError(f"Asked for unit {unit_id!r}; the population has {known}.")
 
-    def keys(self, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
+    def keys(self, unit: str | None = None, condition: str | None = None) -> Keys:
         """Return the episodes of a unit, a condition or both."""
         if unit is not None and condition is not None:
             return tuple(self.episodes[i] for i in self._positions.get((unit, condition), ()))
@@ -291,7 +294,7 @@ class Population(Shown):
         retained = tuple(unit for unit in self.units if unit.id in wanted)
         return replace(self, units=retained, episodes=episodes, source=self.source.restricted(episodes))
 
-    def groups(self) -> Iterator[tuple[str, str, tuple[EpisodeKey, ...]]]:
+    def groups(self) -> Iterator[tuple[str, str, Keys]]:
         """Iterate over (unit, condition, episodes)."""
         for (unit, condition), positions in self._positions.items():
             yield unit, condition, tuple(self.episodes[i] for i in positions)

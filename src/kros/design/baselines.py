@@ -12,14 +12,11 @@ from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, S
 from ..data import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
-from ..observer import Seen
+from ..observer import Screen, Seen, delay_of, like_measurement_noise, one_step_covariance, one_step_residual
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.baselines.trained import Regressor, Rows
-from ..observer.residual import like_measurement_noise, one_step_covariance, one_step_residual
-from ..observer.screen import Screen
-from ..observer.sensor import delay_of
 from .task import Label
 from .validation import TrainingSet, rank
 

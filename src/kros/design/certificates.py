@@ -13,15 +13,22 @@ from ..data import EpisodeBatch, EpisodeKey
 from ..evaluate.errors import error_rms
 from ..identify import ModelSet
 from ..loops import recursion
-from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, relift_certificate, run_observer
+from ..observer import (
+    Observer,
+    ReliftCertificate,
+    ReliftScales,
+    ReliftStatus,
+    Screen,
+    factors,
+    one_step_residual,
+    relift_certificate,
+    run_observer,
+)
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound, linear_estimate
 from ..observer.estimator.gaps import losses
-from ..observer.residual import one_step_residual
 from ..observer.runtime import Guard
-from ..observer.screen import Screen
 from ..observer.simulate import run_observers
-from ..observer.units import factors
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import attained, certify_errors
 from ..uncertainty import UncertainModel

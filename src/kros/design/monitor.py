@@ -17,10 +17,8 @@ from itertools import combinations, product
 import numpy as np
 
 from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen
-from ..observer import Observer
-from ..observer.estimator.regression import spread
+from ..observer import Observer, run_innovations, spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
-from ..observer.simulate import run_innovations
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
 from .validation import TrainingSet
 

@@ -21,8 +21,7 @@ from ..core import Array, ByName, ConfigError, Record, SynthesisError, Work, fro
 from ..data import scaling_of
 from ..identify import IdentifiedModels, ModelSet
 from ..lifting import Lifting
-from ..observer import EstimatorSettings, Sensor
-from ..observer.sensor import Sensors, require_measured
+from ..observer import EstimatorSettings, Sensor, Sensors, require_measured
 from ..observer.units import in_sizes
 from ..uncertainty import UncertainModels
 from .certificates import certificate, certify, usable_problem
@@ -276,6 +275,6 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> Rec
     if calibration is not None and calibration.spec.parameter in observer.lifting.parameters:
         values = {name: getattr(calibration.spec, name) for name in ("angle", "ratio", "reference", "measured")}
         content["parameters"] = {calibration.spec.parameter: {**values, "lag_rad": calibration.lag_rad}}
-    names = (name for name in ("certified", "reason", "bound_percent", "outside") if f"set_{name}" in facts)
-    signals = {name: facts[f"set_{name}"] for name in names}
+    parts = ("certified", "reason", "bound_percent", "outside")
+    signals = {name: facts[f"set_{name}"] for name in parts if f"set_{name}" in facts}
     return dict(plain(content | ({"recorded_signals": signals} if signals else {})))

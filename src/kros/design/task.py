@@ -13,8 +13,7 @@ import numpy as np
 from ..core import Array, ByName, Names, Record, SynthesisError, frozen, gain, load_artifact, loader, save_artifact
 from ..data import Shown
 from ..identify import ModelSet
-from ..observer import Observer, ReliftCertificate, Runtime
-from ..observer.sensor import Sensors, delay_of
+from ..observer import Observer, ReliftCertificate, Runtime, Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .validation import TrainingSet, percent_of, rank
 

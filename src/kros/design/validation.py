@@ -15,8 +15,7 @@ from ..evaluate.errors import error_rms, largest
 from ..evaluate.held_out import observers_run
 from ..evaluate.sensor import as_shown
 from ..identify import IdentifiedModels, ModelSet
-from ..observer import Observer, Seen
-from ..observer.estimator.regression import spread
+from ..observer import Observer, Seen, spread
 from ..observer.sensor import Sensors, in_units
 
 

@@ -190,7 +190,9 @@ def _of_errors(facts: Facts) -> Checks:
     table, hidden = facts.table, facts.hidden
     if table is None:
         return
-    if (better := better_observer(table, facts.deployed, hidden)) is not None:
+    ratio, others = 1 - THRESHOLDS.better, [name for name in table.cells if name != facts.deployed]
+    if rivals := [name for name in others if _smaller(table, name, facts.deployed, hidden, ratio)]:
+        better = min(rivals, key=lambda name: table.mean(name, hidden))  # the most accurate one
         text = f"“{observer_label(better)}” has smaller errors in all hidden channels."
         designed = "relift_certified" in facts.observers.get(better, {})
         export = f"`kros export c --observer {better}` exports it."
@@ -273,12 +275,6 @@ def voids(facts: Facts) -> list[str]:
         texts += ["The unit is worn, badly assembled, or of another batch."]
     rate = 1 / facts.study["sample_period_s"]
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]
-
-
-def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> str | None:
-    """Return the most accurate of the observers that are clearly better in every channel; None where none is."""
-    better = [o for o in table.cells if o != name and _smaller(table, o, name, channels, 1 - THRESHOLDS.better)]
-    return min(better, key=lambda o: table.mean(o, channels), default=None)
 
 
 def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:

@@ -88,8 +88,8 @@ def _calibration(context: Context) -> Record:
     if calibration is None:
         return {}
     spec = calibration.spec
-    names = ("ratio", "angle", "parameter")
-    return {"calibration": {name: getattr(spec, name) for name in names} | {"lag_rad": calibration.lag_rad}}
+    entry = {name: getattr(spec, name) for name in ("ratio", "angle", "parameter")}
+    return {"calibration": entry | {"lag_rad": calibration.lag_rad}}
 
 
 def _models(context: Context) -> Record:

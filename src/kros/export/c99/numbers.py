@@ -10,13 +10,12 @@ import numpy as np
 from ...core import Array, ConfigError, Record, frozen
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
-from ...observer import Observer
+from ...observer import Observer, recorded_channel, recorded_factors
 from ...observer.filter_bank import longest_age
 from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
-from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names, require_identifier
 from .origin import OriginShift, find_shift
 from .realise import RULE, realised

@@ -16,8 +16,7 @@ from pathlib import Path
 
 from ...core import ConfigError, Record, write_bytes
 from ...loops.compiler import compile_library, find_compiler
-from ...observer import Observer
-from ...observer.units import recorded_channel
+from ...observer import Observer, recorded_channel
 from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
 from ..c99.write import c_files

@@ -7,7 +7,7 @@ import numpy as np
 from ...data import EpisodeBatch
 from ...evaluate.validation import correlation
 from ...identify import IdentifiedModels, ModelSet
-from ...observer.residual import one_step_residual
+from ...observer import one_step_residual
 from ..canvas import Captioned, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, set_titles
 from ..names import model_label, model_look, readable_unit, words
 from ..run_folder import RunFolder

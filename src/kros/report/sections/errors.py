@@ -110,7 +110,8 @@ def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
         return min(names, key=lambda name: table.mean(name, channels), default=None)
 
     chosen = [
-        *(("deployed", facts.deployed), ("best with a certificate", best(certified))),
+        ("deployed", facts.deployed),
+        ("best with a certificate", best(certified)),
         ("as published", next(iter(published(table.cells)), None)),
         *(("", name) for name in (best(tuned), "learned", "filtered_difference", f"{facts.model}/open_loop")),
     ]

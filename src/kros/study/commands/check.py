@@ -10,14 +10,13 @@ from urllib.parse import quote
 import numpy as np
 
 from ...core import Array, ConfigError, DataError, Executor, Flags, Record, plain
-from ...data import Population, check_population
+from ...data import Population
+from ...data.recording import check_population
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
 from ...identify.unit_phases import training_keys, unit_parameters
-from ...observer import Observer
-from ...observer.screen import screened
-from ...observer.simulate import run_innovations
+from ...observer import Observer, run_innovations, screened
 from ...report.unit_verdicts import Rows, with_verdict
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import Evidence, Recorded, score_row

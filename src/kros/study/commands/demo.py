@@ -43,8 +43,8 @@ def simulate_to(out: Path, simulation: Simulation) -> None:
         raise ConfigError(f"--format raw: is the layout of motor drives; write {plant} as parquet.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"Output {out}: exists and is not an empty folder; name a new one.")
-    names = ("n_units", "n_episodes", "seconds", "seed", "outlier")
-    simulated = PLANTS[plant](**{name: getattr(simulation, name) for name in names}).simulate()
+    settings = {key: value for key, value in vars(simulation).items() if key not in ("plant", "format")}
+    simulated = PLANTS[plant](**settings).simulate()
     if out.exists():
         out.rmdir()
     if raw:

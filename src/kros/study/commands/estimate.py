@@ -10,7 +10,7 @@ import numpy as np
 
 from ...core import ConfigError, Record, load_artifact, write_bytes
 from ...export.estimates import ENDINGS, writer
-from ...observer.units import recorded_channel, recorded_factors
+from ...observer import recorded_channel, recorded_factors
 from ..config import Stage
 from ..engine.store import open_finished
 from .field import FieldRecordings, status_counts

@@ -14,8 +14,7 @@ from ...evaluate.sensor import as_arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
 from ...identify.survey import RecordingFacts
 from ...loops.compiler import find_compiler
-from ...observer import Observer, run_observer
-from ...observer.units import recorded_factors
+from ...observer import Observer, recorded_factors, run_observer
 from ..config import Stage, StudyConfig
 from ..engine.store import Store, open_finished
 from ..stages.learning import open_source

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...core import ByName, ConfigError, DataError, Progress, Record, Work
-from ...data import Population, check_population, detect_reader
+from ...data import Population, detect_reader
 from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.text import comment, key_lines, mapping_lines
+from ...data.recording import check_population
 from ...identify.survey import UNLOADED, survey
 from ..config import study_schema, validate_config
 from ..stages.learning import FEWEST, open_source

@@ -135,18 +135,13 @@ def _outdate(context: Context, digests: Mapping[Stage, str]) -> None:
 def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, str]:
     """Return digests of what stages follow from: kros, the stages before, recordings, their part of the study."""
     tables, digest, digests = context.config.dump(), code_key(), dict[Stage, str]()
+    tables |= {f"{section}.{key}": v for section, of in tables.items() if isinstance(of, dict) for key, v in of.items()}
     for step in steps:
         if step.wanted(context.config):
             inputs = inputs_digest(context) if step.stage is Stage.READ else ""
-            digest = digest_of(digest, str(step.stage), inputs, [_part(tables, name) for name in step.sections])
+            digest = digest_of(digest, str(step.stage), inputs, [tables[name] for name in step.sections])
             digests[step.stage] = digest
     return digests
-
-
-def _part(tables: Mapping[str, Mapping[str, object]], name: str) -> object:
-    """Return a section of a study, or a ``section.key``."""
-    section, _, key = name.partition(".")
-    return tables[section][key] if key else tables[section]
 
 
 def inputs_digest(context: Context) -> str:

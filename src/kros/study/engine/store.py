@@ -178,15 +178,11 @@ class Store:
                 _remove(path)
 
     def sweep(self) -> None:
-        """Remove what the run does not use any more from its store."""
-        _sweep(self.artefacts, self._named())
-
-    def _named(self) -> set[str]:
-        """Digests of all artefacts of this run and of those inside, and of results that they were computed from."""
+        """Remove from the store what neither this run nor one inside, or an artefact of theirs, follows from."""
         inside = [replace(self, folder=path.parent) for path in self.folder.glob(f"*/*/{MANIFEST}")]
         digests = {artefact.digest for run in (self, *inside) for artefact in run.manifest.values()}
         stored = [artefact for artefact in map(self.stored, digests) if artefact is not None]
-        return {digest for artefact in stored for digest in (artefact.digest, *artefact.results)}
+        _sweep(self.artefacts, {digest for artefact in stored for digest in (artefact.digest, *artefact.results)})
 
 
 def _sweep(folder: Path, named: Collection[str]) -> None:

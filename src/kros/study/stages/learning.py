@@ -15,8 +15,8 @@ from ...identify.calibration import calibrate
 from ...identify.identify import with_models
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...identify.survey import Copy, check_usable, survey
+from ...observer import require_measured
 from ...observer.residual import FEWEST_SAMPLES
-from ...observer.sensor import require_measured
 from ...uncertainty import quantify
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep

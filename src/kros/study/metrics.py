@@ -3,8 +3,6 @@
 What was not run is absent, what is unknown is null, nothing is invented.
 """
 
-from __future__ import annotations
-
 from ..core import Record, load_artifact, plain
 from ..evaluate.intervals import interval_rows
 from ..observer import Observer

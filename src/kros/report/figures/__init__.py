@@ -3,8 +3,6 @@
 The function of a row takes a `RunFolder` and the options of the row; it returns the figure and more of its caption.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import field
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Sections of the report, from ``metrics.json`` alone: first what decides, then the evidence, which is folded."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from ..content import Section

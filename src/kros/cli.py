@@ -5,8 +5,6 @@ met; 4 `kros check` cannot decide on a unit; 128 and the number of a signal that
 each exception, with the way to the traceback of a defect.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging
@@ -22,8 +20,7 @@ from typing import Annotated, Any, TextIO
 import typer
 from typer.core import TyperGroup
 
-from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
-from .core.work import Progress
+from .core import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError, Progress
 
 FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
 _SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]

@@ -8,6 +8,8 @@ Examples
 1.0
 """
 
+from .arrays import AnyArray, Array, ArrayLike, Bits, ByName, Columns, Flags, Names, Parameters, Record, Whole, frozen
+from .artifacts import Storable, digest_of, load_artifact, loader, plain, read_json, save_artifact, united, write_json
 from .errors import (
     ConfigError,
     DataError,
@@ -17,9 +19,13 @@ from .errors import (
     MissingDependencyError,
     SynthesisError,
 )
+from .files import did_you_mean, is_file, read_toml, require_regular, shortened, stamp_of, whole_folder, write_bytes
 from .lti import StateSpace, block_diagonal, gain
 from .norms import h2_norm, hinf_norm
 from .removed import refusing
+from .rounding import AGREED, EPS, ITERATED, ROUNDING, SINGULAR, TINY
+from .settings import Settings, member, require_kind
+from .work import Executor, Progress, Work
 
 __all__ = [
     "ConfigError",

@@ -1,4 +1,4 @@
-"""Types of arrays, and objects that hold arrays."""
+"""Types of arrays, of names and of records, and objects that hold arrays."""
 
 from __future__ import annotations
 
@@ -14,9 +14,13 @@ T = TypeVar("T")
 AnyArray = NDArray[Any]
 Array = NDArray[np.float64]
 Bits = NDArray[np.uint8]
+ByName = Mapping[str, Any]  # values by name, to be read
+Columns = tuple[int, ...]  # positions of channels
 Flags = NDArray[np.bool_]
 Index = NDArray[np.intp]
+Names = tuple[str, ...]  # and other texts
 Parameters = Mapping[str, ArrayLike]  # of a lifting, by name
+Record = dict[str, Any]  # values by name, as in JSON
 Whole = NDArray[np.int64]
 
 

@@ -19,17 +19,17 @@ from dataclasses import fields, is_dataclass
 from functools import cache, wraps
 from pathlib import Path
 from types import GenericAlias
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter
 from pydantic_core import to_jsonable_python
 
 from . import limits
+from .arrays import ByName, Record, T
 from .errors import DataError, KrosError
 from .files import pass_on_shortage, read_bytes, shortened, write_bytes
 
-T = TypeVar("T")
 SCHEMA = 1
 CHECKSUM, _ARRAY = "checksum", "array in arrays.npz"
 _AGAIN = "write it again with the step that made it"
@@ -75,18 +75,18 @@ def _finite(text: str) -> float:
     raise ValueError(f"{text} is not a number of JSON")
 
 
-def _digest(content: Mapping[str, Any]) -> str:
+def _digest(content: ByName) -> str:
     content = {key: value for key, value in content.items() if key != CHECKSUM}
     return "sha256:" + hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def with_checksum(content: Mapping[str, Any]) -> dict[str, Any]:
+def with_checksum(content: ByName) -> Record:
     """Return the content, in JSON's own types, with its checksum as the last key."""
-    whole: dict[str, Any] = plain(content)
+    whole: Record = plain(content)
     return {**whole, CHECKSUM: _digest(whole)}
 
 
-def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
+def check_checksum(content: ByName, path: Path) -> bool:
     """Refuse content of `read_json` that is not what its checksum says; False where it has none."""
     if CHECKSUM in content and content[CHECKSUM] != _digest(content):
         problem = "the content does not fit its checksum, so it was changed or damaged since it was written"
@@ -118,9 +118,7 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"Reading {path}: {problem}; {_AGAIN}.") from error
 
 
-def save_artifact(
-    folder: Path, kind: str, content: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
-) -> None:
+def save_artifact(folder: Path, kind: str, content: ByName, arrays: Mapping[str, np.ndarray] | None = None) -> None:
     """Write `<kind>.json` (with schema version and checksum) and, where there are arrays, `arrays.npz`."""
     folder = Path(folder)
     whole = {"schema": SCHEMA, "kind": kind, **content}
@@ -131,7 +129,7 @@ def save_artifact(
     write_json(folder / f"{kind}.json", with_checksum(whole))
 
 
-def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def load_artifact(folder: Path, kind: str) -> tuple[Record, dict[str, np.ndarray]]:
     """Read what `save_artifact` wrote and check kind, schema version and checksum."""
     folder = Path(folder)
     path, archive = folder / f"{kind}.json", folder / "arrays.npz"
@@ -188,13 +186,12 @@ class Storable:
     @loader
     def load(cls, folder: Path) -> Self:
         """Read what `save` wrote."""
-        value: Self = united(cls, *load_artifact(folder, cls.KIND))
-        return value
+        return united(cls, *load_artifact(folder, cls.KIND))
 
 
 def divided(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
     """Return a value in JSON's types, numbers that JSON has not as texts, and its arrays by where they are in it."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays = dict[str, np.ndarray]()
 
     def plain_of(part: Any, name: str) -> Any:
         if isinstance(part, np.ndarray):

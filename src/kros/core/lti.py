@@ -165,8 +165,7 @@ def gain(matrix: ArrayLike, dt: float) -> StateSpace:
     5.0
     """
     D = np.atleast_2d(np.asarray(matrix, dtype=float))
-    p, m = D.shape
-    return StateSpace(np.zeros((0, 0)), np.zeros((0, m)), np.zeros((p, 0)), D, dt)
+    return StateSpace(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((len(D), 0)), D, dt)
 
 
 def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:

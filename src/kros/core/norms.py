@@ -28,7 +28,7 @@ from .lti import StateSpace
 from .rounding import AGREED, EPS, ITERATED, TINY
 
 _MAX_ITERATIONS = 60
-_DIGITS, _MOST_DIGITS, _MOST_STATES = 40, 160, 60  # of multiple precision, where double does not suffice
+_DIGITS, _MOST_STATES = (40, 80, 160), 60  # of multiple precision, where double does not suffice
 _AGREE = 1e-7  # relative difference of what should be equal, beyond which double precision is not trusted
 
 
@@ -150,12 +150,11 @@ def hinf_norm(system: Any, tol: float = AGREED) -> float:
         raise KrosError(f"H-infinity norm: tol should be positive, found {tol}.")
     if not system.is_stable():
         return float("inf")
-    if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
+    if not (system.n_states and system.D.size):
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = balanced(to_continuous(system) if system.dt > 0 else system)
     known = first_frequencies(continuous.poles())
-    at, lower = _largest(system, known)
-    at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
+    at, lower = max(_largest(system, known), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
@@ -233,8 +232,7 @@ def crossings(system: StateSpace, gamma: float) -> AnyArray:
     """Frequencies at which a singular value may equal `gamma`, with the points between them."""
     A, B, C, D = system.A, system.B, system.C, system.D
     R = gamma**2 * np.eye(system.n_inputs) - D.T @ D
-    F = np.linalg.solve(R, np.hstack([D.T @ C, B.T]))
-    n = system.n_states
+    F, n = np.linalg.solve(R, np.hstack([D.T @ C, B.T])), system.n_states
     closed = A + B @ F[:, :n]
     # gamma scales the two halves alike, which keeps the eigenvalues and balances the blocks.
     Q = C.T @ C + C.T @ D @ F[:, :n]
@@ -254,14 +252,14 @@ def precise_h2_norm(system: StateSpace) -> float:
     if system.n_states > _MOST_STATES:
         problem = f"double precision does not suffice, and multiple precision takes at most {_MOST_STATES} states"
         raise SynthesisError(f"H2 norm: {problem}, found {system.n_states}; reduce the system, or scale its states.")
-    before, digits = None, _DIGITS
-    while digits <= _MOST_DIGITS:
+    before = np.nan
+    for digits in _DIGITS:
         with mpmath.workdps(digits):
             norm = _norm_of(mpmath, system)
-        if before is not None and (norm == before or abs(norm - before) <= ITERATED * abs(norm)):
+        if norm == before or abs(norm - before) <= ITERATED * abs(norm):
             return norm
-        before, digits = norm, 2 * digits
-    problem = f"no two results agree with up to {_MOST_DIGITS} digits"
+        before = norm
+    problem = f"no two results agree with up to {_DIGITS[-1]} digits"
     raise SynthesisError(f"H2 norm: {problem}; the system has poles on the stability limit.")
 
 
@@ -288,7 +286,7 @@ def precise_gain(system: StateSpace, freq_hz: float) -> float:
     """Largest singular value at one frequency, the resolvent in multiple precision."""
     import mpmath
 
-    with mpmath.workdps(_DIGITS):
+    with mpmath.workdps(_DIGITS[0]):
         s = mpmath.mpc(0, 2 * mpmath.pi * mpmath.mpf(freq_hz))
         point = mpmath.exp(s * mpmath.mpf(system.dt)) if system.dt > 0 else s
         A, B, C, D = (mpmath.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C, system.D))

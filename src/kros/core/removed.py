@@ -18,8 +18,8 @@ Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; m
 Keys for details of a method are no longer part of a study; remove the key, or call the function of the stage in Python.
     uncertainty: structure nominal max_order tolerance_db false_alarm_rate lifting: parameters calibrate: settle_s
     identify: margin largest_residual alpha_factor synthesis: set injection max_states tune input_weight penalty
-    time_limit_s evaluate: monte_carlo observer: false_alarm_rate load: angle_rad memories condition
-    angle current limit level_s
+    time_limit_s evaluate: monte_carlo observer: false_alarm_rate load: angle_rad memories condition angle current limit
+    level_s
 Limits, requirements and dropped units are no longer part of a study; remove the key, see metrics.json and data.exclude.
     limits require require: robust no_outliers uncertainty: drop_outliers
 The deployed observer is no longer named in a study; remove the key deployed, and use kros export c --observer.
@@ -34,8 +34,7 @@ Parts of the uncertainty are no longer public; use quantify, which takes models,
 Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify.
     kros.interop: AdoptedModel models_from_pykoop one_step_pairs
 Readers of one format, and steps that follow events, are no longer part of kros; use kros.read and a class from Step.
-    kros.data: read_csv_folder read_motor_drive_raw check_population TrueChannel
-    kros.data.steps: ByDirection Cut Tare
+    kros.data: read_csv_folder read_motor_drive_raw check_population TrueChannel kros.data.steps: ByDirection Cut Tare
 Families that join texts, and centres and kernels to choose from, are no longer part of kros; write the formulas.
     kros.lifting: grid_centres latin_hypercube_centres random_centres formulas products Kernel concatenate
 Random members of the uncertain set are no longer drawn; use the certificate, which bounds all of them.
@@ -117,9 +116,7 @@ REMOVED = tuple(
 
 def instead_of(place: str) -> str:
     """Return the sentence for a name, or a key or value whose section may be missing; empty where it never was."""
-    matches = (
-        sentence for sentence, places in REMOVED if any(p == place or p.endswith(f".{place}") for p in places.split())
-    )
+    matches = (sentence for sentence, places in REMOVED if any(f".{p}".endswith(f".{place}") for p in places.split()))
     return next(matches, "")
 
 

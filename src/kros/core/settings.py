@@ -7,11 +7,11 @@ from typing import Any, Self, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from .arrays import T
 from .errors import ConfigError
 from .files import did_you_mean, shortened
 from .removed import instead_of
 
-T = TypeVar("T")
 E = TypeVar("E", bound=Enum)
 _OF_FAMILIES = (TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError)  # their arguments
 

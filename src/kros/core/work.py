@@ -9,19 +9,20 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
+from functools import partial
 from operator import call
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
+from .arrays import T, frozen
 from .artifacts import digest_of, divided, json_bytes, pack_arrays, united, unpack_arrays
 from .errors import DataError
 from .files import read_bytes, write_bytes
 from .limits import MAX_ARRAYS_BYTES
 
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 
@@ -46,7 +47,7 @@ class Progress:
         """A stage is done, or was skipped."""
 
 
-@dataclass(frozen=True)
+@frozen
 class Results:
     """Results in a folder, computed with the `source` of kros; `used` are those of the maps so far."""
 
@@ -63,18 +64,19 @@ class Results:
         return self.folder / f"{digest}.npz"
 
 
-def _read(path: Path | None, kind: Any) -> Any:
-    """Return a result, or None where there is none or it cannot be read."""
+def _read(path: Path | None, kind: Any, usable: Callable[[Any], bool]) -> Any:
+    """Return a result that is usable, or None where there is none or it cannot be read."""
     if path is None or not path.exists():
         return None
     try:
-        return unpacked(read_bytes(path, MAX_ARRAYS_BYTES), path, kind)
+        result = unpacked(read_bytes(path, MAX_ARRAYS_BYTES), path, kind)
     except (DataError, ValueError, LookupError, TypeError, AttributeError) as error:
         log.warning("%s: a result cannot be read (%s), and is computed again", path, error)
         return None
+    return result if usable(result) else None
 
 
-@dataclass(frozen=True)
+@frozen
 class Storing:
     """A function of a path and a task, whose result is written where it has a path."""
 
@@ -101,7 +103,7 @@ def unpacked(content: bytes, path: Path, kind: Any) -> Any:
     return united(kind, json.loads(arrays["content"].tobytes()), arrays)
 
 
-@dataclass(frozen=True)
+@frozen
 class Work:
     """An executor, a progress listener and earlier results; by default work runs here, in silence, without results."""
 
@@ -135,8 +137,7 @@ class Work:
             yield from self.map(title, function, tasks)
             return
         pairs = [(self.results.place(function, mark), task) for mark, task in zip(marks, tasks, strict=True)]
-        read = [_read(path, kind) for path, _ in pairs]
-        earlier = [r if r is None or usable(task, r) else None for r, (_, task) in zip(read, pairs, strict=True)]
+        earlier = [_read(path, kind, partial(usable, task)) for path, task in pairs]
         new = [pair for pair, result in zip(pairs, earlier, strict=True) if result is None]
         if new:
             log.info("%s: %d of %d are new or changed", title, len(new), len(pairs))
@@ -147,10 +148,9 @@ class Work:
 
     def run(self, title: str, work: Iterable[Callable[[], T]]) -> list[T]:
         """Run independent pieces of work, in order."""
-        return self.begin(title, work)()
+        return list(self.map(title, call, work))
 
     def begin(self, title: str, work: Iterable[Callable[[], T]]) -> Callable[[], list[T]]:
         """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""
-        pieces = list(work)
-        running = self.executor.map(call, pieces)
-        return lambda: list(self._followed(title, len(pieces), running))
+        results = self.map(title, call, work)
+        return lambda: list(results)

@@ -13,14 +13,27 @@ Examples
 (('angle',), (50, 3))
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 from . import steps
-from .batch import EpisodeBatch
-from .population import Channel, EpisodeKey, Population, Role, Unit, split_episodes
+from .batch import EpisodeBatch, hold_missing
+from .population import (
+    DEFAULT_CONDITION,
+    OUTLIERS,
+    Channel,
+    EpisodeKey,
+    Population,
+    Role,
+    Unit,
+    natural_key,
+    scaling_of,
+    split_episodes,
+)
 from .prepare import prepare
 from .readers.arrays import from_arrays, from_frame
-from .readers.opening import read
+from .readers.opening import detect_reader, read
 from .readers.parquet import read_parquet, write_parquet
+from .recording import NonFiniteError, some
+from .shown import Shown
 
 __all__ = [
     "Channel",

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, Whole, frozen
-from ..core.errors import DataError
-from .population import EpisodeKey, Population
+from ..core import Array, DataError, Flags, Names, Record, Whole, frozen
+from .population import EpisodeKey, Keys, Population
 from .recording import some
 
 
@@ -46,7 +45,7 @@ class EpisodeBatch:
     ((4, 4, 1), [4, 3, 4, 3])
     """
 
-    keys: tuple[EpisodeKey, ...]
+    keys: Keys
     lengths: Whole
     states: Array
     inputs: Array
@@ -92,7 +91,7 @@ class EpisodeBatch:
         return cls(keys, lengths, values[..., :n], inputs, population.sample_period_s, shared)
 
     @property
-    def units(self) -> tuple[str, ...]:
+    def units(self) -> Names:
         """The unit of every episode."""
         return tuple(k.unit for k in self.keys)
 
@@ -119,7 +118,7 @@ class EpisodeBatch:
         signals = self._signals(np.s_[:, rows])
         return replace(self, keys=keys, lengths=self.lengths[rows], parameters=parameters, **signals)
 
-    def _signals(self, part: Any) -> dict[str, Any]:
+    def _signals(self, part: Any) -> Record:
         """Return a part of every signal, by samples or by episodes."""
         signals = {name: getattr(self, name) for name in ("states", "inputs", "shown", "lost", "truths")}
         parts = {name: None if signal is None else signal[part] for name, signal in signals.items()}

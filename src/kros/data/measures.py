@@ -1,7 +1,5 @@
 """Units of measure: how headers write them, what kind of quantity they measure, and their conversion to SI by pint."""
 
-from __future__ import annotations
-
 import math
 import re
 import unicodedata
@@ -10,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from ..core.rounding import AGREED
+from ..core import AGREED
 
 # SI units as kros writes them, with the kind of quantity
 _SI = """

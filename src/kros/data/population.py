@@ -16,9 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array
-from ..core.errors import DataError
-from ..core.settings import member
+from ..core import Array, ByName, Columns, DataError, Names, Record, member
 from .shown import Shown
 
 DEFAULT_CONDITION = "default"
@@ -76,6 +74,9 @@ class Channel:
         return f"{self.name} ({self.unit or '1'}{', measured' * self.measured})"
 
 
+Channels = tuple[Channel, ...]
+
+
 @dataclass(frozen=True)
 class Unit:
     """One machine of the batch, with what is known about it.
@@ -89,7 +90,7 @@ class Unit:
 
     id: str
     group: str = ""
-    metadata: Mapping[str, Any] = field(default_factory=dict)
+    metadata: ByName = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,9 @@ class EpisodeKey:
 
     def __str__(self) -> str:
         return f"episode {self.episode} of unit {self.unit} ({self.condition})"
+
+
+Keys = tuple[EpisodeKey, ...]
 
 
 @cache
@@ -142,7 +146,7 @@ def columns_in_order(channels: Iterable[Any]) -> tuple[Any, ...]:
     return tuple(sorted(channels, key=lambda c: list(Role).index(c.role)))
 
 
-def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
+def part_columns(columns: Iterable[Channel]) -> Record:
     """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
     columns = tuple(columns)
     truths = tuple(c for c in columns if c.role is Role.TRUTH)
@@ -153,8 +157,8 @@ def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
 class Split:
     """Training and test episodes, in natural order."""
 
-    train: tuple[EpisodeKey, ...]
-    test: tuple[EpisodeKey, ...]
+    train: Keys
+    test: Keys
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -190,13 +194,13 @@ class Population(Shown):
     (5, 2)
     """
 
-    channels: tuple[Channel, ...]
+    channels: Channels
     sample_period_s: float
     units: tuple[Unit, ...]
-    episodes: tuple[EpisodeKey, ...]
+    episodes: Keys
     source: Any  # kros.data.prepare.PreparedSource
-    metadata: Mapping[str, Any] = field(default_factory=dict)
-    truths: tuple[Channel, ...] = ()
+    metadata: ByName = field(default_factory=dict)
+    truths: Channels = ()
     scaling: Mapping[str, Scaling] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -207,43 +211,43 @@ class Population(Shown):
         channels = f"states {states}; inputs {', '.join(self.inputs) or 'none'}{true}"
         return f"Population({sizes} every {self.sample_period_s:g} s; {channels})"
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         rows = {f"{role.value}s": ", ".join(c.label for c in self.columns if c.role is role) for role in Role}
         counts = {"units": len(self.unit_ids), "episodes": len(self.episodes)}
         return {**counts, "conditions": ", ".join(self.conditions), "period": f"{self.sample_period_s:g} s", **rows}
 
     @property
-    def columns(self) -> tuple[Channel, ...]:
+    def columns(self) -> Channels:
         """All columns of the source: channels, then truths."""
         return self.channels + self.truths
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> Names:
         """Names of the states, in column order."""
         return tuple(c.name for c in self.channels if c.role is Role.STATE)
 
     @property
-    def inputs(self) -> tuple[str, ...]:
+    def inputs(self) -> Names:
         """Names of the inputs, in column order."""
         return tuple(c.name for c in self.channels if c.role is Role.INPUT)
 
     @property
-    def measured(self) -> tuple[str, ...]:
+    def measured(self) -> Names:
         """Names of the states that are available at run time."""
         return tuple(c.name for c in self.channels if c.role is Role.STATE and c.measured)
 
     @property
-    def true_states(self) -> tuple[int, ...]:
+    def true_states(self) -> Columns:
         """Columns of the states that the truths are the truths of, in the order of the truths."""
         return tuple(self.states.index(t.of) for t in self.truths)
 
     @property
-    def unit_ids(self) -> tuple[str, ...]:
+    def unit_ids(self) -> Names:
         """Identifiers of the units, in order."""
         return tuple(u.id for u in self.units)
 
     @cached_property
-    def conditions(self) -> tuple[str, ...]:
+    def conditions(self) -> Names:
         """Conditions, in natural order."""
         return tuple(sorted({condition for _, condition in self._positions}, key=natural_key))
 
@@ -254,7 +258,7 @@ class Population(Shown):
         known = ", ".join(self.unit_ids[:10]) + (" ..." if len(self.units) > 10 else "")
         raise DataError(f"Asked for unit {unit_id!r}; the population has {known}.")
 
-    def keys(self, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
+    def keys(self, unit: str | None = None, condition: str | None = None) -> Keys:
         """Return the episodes of a unit, a condition or both."""
         if unit is not None and condition is not None:
             return tuple(self.episodes[i] for i in self._positions.get((unit, condition), ()))
@@ -290,7 +294,7 @@ class Population(Shown):
         retained = tuple(unit for unit in self.units if unit.id in wanted)
         return replace(self, units=retained, episodes=episodes, source=self.source.restricted(episodes))
 
-    def groups(self) -> Iterator[tuple[str, str, tuple[EpisodeKey, ...]]]:
+    def groups(self) -> Iterator[tuple[str, str, Keys]]:
         """Iterate over (unit, condition, episodes)."""
         for (unit, condition), positions in self._positions.items():
             yield unit, condition, tuple(self.episodes[i] for i in positions)
@@ -298,7 +302,7 @@ class Population(Shown):
     @cached_property
     def _positions(self) -> dict[tuple[str, str], list[int]]:
         """Positions of the episodes of each unit and condition."""
-        positions: dict[tuple[str, str], list[int]] = {}
+        positions = dict[tuple[str, str], list[int]]()
         for i, key in enumerate(self.episodes):
             positions.setdefault((key.unit, key.condition), []).append(i)
         return positions
@@ -338,8 +342,9 @@ def split_episodes(population: Population, test: Iterable[str] | None = None) ->
         names = {k.episode for k in ordered[-max(1, len(ordered) // 10) :]} if named is None else named
         train, tested = (tuple(k for k in ordered if (k.episode in names) is part) for part in (False, True))
         if not train or not tested:
-            left = f"leaves {len(train)} for training and {len(tested)} for testing of {[k.episode for k in ordered]}"
-            advice = "name some of them, not all"
-            raise DataError(f"{where}: split.test = {sorted(names, key=natural_key)} {left}; {advice}.")
+            raise DataError(
+                f"{where}: split.test = {sorted(names, key=natural_key)} leaves {len(train)} for training and "
+                f"{len(tested)} for testing of {[k.episode for k in ordered]}; name some of them, not all."
+            )
         splits[unit, condition] = Split(train, tested)
     return splits

@@ -10,11 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ValidationError
 
-from ..core.arrays import Array, frozen
-from ..core.artifacts import digest_of, united
-from ..core.errors import ConfigError, DataError
-from ..core.files import shortened, stamp_of
-from .population import Channel, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key, part_columns
+from ..core import Array, ByName, ConfigError, DataError, Record, digest_of, frozen, shortened, stamp_of, united
+from .population import Channels, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key, part_columns
 from .recording import (
     Recording,
     Recordings,
@@ -35,7 +32,7 @@ class PreparedSource:
     """Read a recording, check its time, apply the steps, check the result."""
 
     recordings: Recordings
-    channels: tuple[Channel, ...]  # as recorded: states, inputs, truths
+    channels: Channels  # as recorded: states, inputs, truths
     period_s: float  # as recorded, found in the episode `reference`
     reference: EpisodeKey
     steps: tuple[Step, ...] = ()
@@ -55,7 +52,7 @@ class PreparedSource:
             file = self.recordings.file(self.recordings.places[recording.key])
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
 
-    def _prepared(self, recording: Recording) -> tuple[Array, tuple[Channel, ...]]:
+    def _prepared(self, recording: Recording) -> tuple[Array, Channels]:
         """Return what steps make of an episode, or of a part of it, and the channels."""
         signals = Signals(self.channels, self.period_s)
         # A running observer has to see that a sample is missing; training does not.
@@ -89,10 +86,10 @@ class PreparedSource:
 
 def assemble(
     recordings: Recordings,
-    channels: tuple[Channel, ...],
+    channels: Channels,
     units: Iterable[Unit] = (),
     sample_period_s: float | None = None,
-    metadata: Mapping[str, Any] | None = None,
+    metadata: ByName | None = None,
     *,
     steps: Iterable[Step] = (),
     scaling: Scalings | None = None,
@@ -109,7 +106,7 @@ def assemble(
         sample_period_s = estimate_period(next(recordings.blocks(episodes[0], HEAD)))
     period = check_period(sample_period_s, "Population")
     source = PreparedSource(recordings, channels, period, episodes[0])
-    about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
+    about: Record = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
     population = Population(sample_period_s=period, units=known, episodes=episodes, source=source, **about)
     return prepare(population, steps)
 
@@ -152,17 +149,17 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     for step in added:
         signals = step.describe(signals)
     check_structure(signals.channels, population.episodes)
-    about: dict[str, Any] = {"scaling": signals.scaling, **part_columns(signals.channels)}
+    about: Record = {"scaling": signals.scaling, **part_columns(signals.channels)}
     source = replace(population.source, steps=population.source.steps + added)
     return replace(population, sample_period_s=signals.period_s, source=source, **about)
 
 
-def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.prepare") -> tuple[Step, ...]:
+def parse_steps(tables: Iterable[Step | ByName], where: str = "data.prepare") -> tuple[Step, ...]:
     """Return steps from TOML tables such as ``{"step": "trim", "start": 1000}``; steps pass through."""
     return tuple(t if isinstance(t, Step) else _parse_step(t, f"{where}[{i}]") for i, t in enumerate(tables))
 
 
-def _parse_step(table: Mapping[str, Any], where: str) -> Step:
+def _parse_step(table: ByName, where: str) -> Step:
     """Return the step of one table."""
     name = table.get("step") if isinstance(table, Mapping) else None
     if not isinstance(name, str) or name not in STEPS:
@@ -183,7 +180,7 @@ class _Divide(Step):
     sizes: tuple[float, ...]
     samplewise: ClassVar[bool] = True
 
-    def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording in the sizes."""
         return replace(recording, values=recording.values / np.array(self.sizes))
 

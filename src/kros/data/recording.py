@@ -17,11 +17,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import limits
+from ..core import AGREED, ROUNDING, DataError, limits, shortened
 from ..core.arrays import Array, Flags, Index, frozen
-from ..core.errors import DataError
-from ..core.files import shortened
-from ..core.rounding import AGREED, ROUNDING
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 
@@ -149,9 +146,10 @@ def check_increasing(recording: Recording, where: str = "") -> None:
     bad = np.flatnonzero(~(np.diff(time) > 0))
     if bad.size:
         k = int(bad[0])
-        actual = f"found {time[k]:g} s at sample {k} and {time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps)"
-        advice = "remove repeated or disordered samples"
-        raise DataError(f"{title(recording.key)}{where}: time should increase, {actual}; {advice}.")
+        raise DataError(
+            f"{title(recording.key)}{where}: time should increase, found {time[k]:g} s at sample {k} and "
+            f"{time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps); remove repeated or disordered samples."
+        )
 
 
 def check_even(recording: Recording, period_s: float, reference: EpisodeKey, where: str = "") -> None:
@@ -378,7 +376,7 @@ def digest_of(values: Array) -> str:
 
 def copies_among(digests: Iterable[tuple[EpisodeKey, str]]) -> Iterator[tuple[EpisodeKey, EpisodeKey]]:
     """Yield the episodes that are copies of earlier ones, with these."""
-    first: dict[str, EpisodeKey] = {}
+    first = dict[str, EpisodeKey]()
     for key, digest in digests:
         if first.setdefault(digest, key) != key:
             yield key, first[digest]

@@ -29,19 +29,14 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ConfigDict
 
-from ..core import limits
-from ..core.arrays import Array
-from ..core.errors import ConfigError, DataError
-from ..core.files import did_you_mean
-from ..core.removed import refusing
-from .population import Channel, Role, Scalings, scaling_of
+from ..core import Array, ConfigError, DataError, Names, did_you_mean, limits, refusing
+from .population import Channel, Channels, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim"]
 __getattr__ = refusing(__name__)
 
 GAP = 10.0  # median steps of time that a straight line bridges
-Channels = tuple[Channel, ...]
 
 
 @dataclass(frozen=True)
@@ -79,7 +74,7 @@ class Step:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     @property
-    def named(self) -> tuple[str, ...]:
+    def named(self) -> Names:
         """Channels that this step needs."""
         names = getattr(self, "channels", None) or (getattr(self, "channel", None), getattr(self, "reference", None))
         return tuple(name for name in names if name is not None)
@@ -118,7 +113,7 @@ class Step:
 class Scale(Step):
     """Multiply channels by a factor and add an offset; `unit` names the new unit of measure."""
 
-    channels: tuple[str, ...]
+    channels: Names
     factor: float
     unit: str | None = None
     offset: float = 0.0
@@ -153,7 +148,7 @@ class Shift(Step):
     The value recorded at sample ``k + lag`` is moved to sample ``k``; the ends that have no partner are cut.
     """
 
-    channels: tuple[str, ...]
+    channels: Names
     lag: int
     step: ClassVar[str] = "shift"
 
@@ -199,9 +194,10 @@ class Offset(Step):
         """Return the recording with the offset removed."""
         columns = self.columns((self.channel, self.reference), channels)
         if len(recording.values) < self.stop:
-            needs = f"the offset of {self.channel!r} is calibrated over samples {self.start}-{self.stop - 1}"
-            actual = f"the episode has {len(recording.values)}"
-            raise DataError(f"{title(recording.key)}: {needs}, {actual}; leave the episode out.")
+            raise DataError(
+                f"{title(recording.key)}: the offset of {self.channel!r} is calibrated over samples "
+                f"{self.start}-{self.stop - 1}, the episode has {len(recording.values)}; leave the episode out."
+            )
         window = recording.values[self.start : self.stop, columns]
         check_finite(window, recording.key, [channels[i] for i in columns], first=self.start)
         values = recording.values.copy()
@@ -229,9 +225,10 @@ class Trim(Step):
         n = len(recording.values)
         stop = min(n if self.stop is None else self.stop, n - self.tail)
         if stop <= self.start:
-            bounds = f"start = {self.start}, stop = {self.stop}, tail = {self.tail}"
-            advice = "leave the episode out or trim less"
-            raise DataError(f"{title(recording.key)}: trimming to {bounds} leaves nothing of {n} samples; {advice}.")
+            raise DataError(
+                f"{title(recording.key)}: trimming to start = {self.start}, stop = {self.stop}, tail = {self.tail} "
+                f"leaves nothing of {n} samples; leave the episode out or trim less."
+            )
         return recording.cut(self.start, stop)
 
 

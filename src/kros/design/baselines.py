@@ -1,26 +1,20 @@
 """Baselines without a certificate, since they are no constant correction of a model; they run in the evaluation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from ..core.arrays import Array, Parameters, frozen
-from ..core.errors import ConfigError, DataError, SynthesisError
-from ..data.population import EpisodeKey, Population
+from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, SynthesisError, frozen
+from ..data import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
-from ..observer import Seen
+from ..observer import Screen, Seen, delay_of, like_measurement_noise, one_step_covariance, one_step_residual
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.baselines.trained import Regressor, Rows
-from ..observer.residual import like_measurement_noise, one_step_covariance, one_step_residual
-from ..observer.screen import Screen
-from ..observer.sensor import delay_of
 from .task import Label
 from .validation import TrainingSet, rank
 
@@ -58,14 +52,14 @@ class Baseline:
     """A baseline that was tuned or trained."""
 
     by_unit: Mapping[str, Estimator]
-    measured: tuple[int, ...]
-    estimated: tuple[int, ...]
-    facts: dict[str, Any]
+    measured: Columns
+    estimated: Columns
+    facts: Record
     seen: Seen | None = None
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Mapping[str, Array]) -> Array:
         """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
-        units: dict[str, list[int]] = {}
+        units = dict[str, list[int]]()
         for i, key in enumerate(keys):
             units.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
         samples, parts = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), list[Array]()
@@ -105,14 +99,16 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
     return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
 
 
-def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
+def make_difference(training: TrainingSet, measured: Columns) -> Baseline:
     """Choose the cut-off of the filtered difference and find its scale."""
     population, batch = training.population, training.read()
     y, period = batch.measurements(measured), population.sample_period_s
     pairs = followed(batch, measured)
     if not pairs:
-        problem = f"no state of {', '.join(population.states)} follows the rate of a measured one"
-        raise ConfigError(f"Filtered difference: {problem}; record the rate.")
+        raise ConfigError(
+            f"Filtered difference: no state of {', '.join(population.states)} follows the rate of a measured one; "
+            "record the rate."
+        )
     estimated = tuple(state for _, state in pairs)
     plain = (FilteredDifference(len(population.states), pairs, float(cutoff), period) for cutoff in cutoffs_hz(period))
     trials = [trial.scaled_to(batch, measured) for trial in plain]
@@ -123,7 +119,7 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
     return Baseline({"": best}, measured, estimated, facts, seen=training.seen)
 
 
-def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
+def make_learned(training: TrainingSet, measured: Columns) -> Baseline:
     """Train the learned estimator on whole training episodes of all units, once for every unit without it."""
     samples = len(training.population.read(training.keys[0])) * len(training.keys)
     step = max(1, samples // Ridge().rows)
@@ -133,7 +129,7 @@ def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)
 
 
-def make_trained(training: TrainingSet, measured: tuple[int, ...], kind: Regressor) -> Baseline:
+def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> Baseline:
     """Train a regression of scikit-learn on whole training episodes of all units, and without each fold of them."""
     lengths = [len(batch.states) for batch in training.one_by_one()]
     rows = Rows.of(training.one_by_one(), measured, lengths)
@@ -149,7 +145,7 @@ class MeanProfile:
     """Mean states of motions that are known by their inputs, for machines that repeat a motion."""
 
     n_states: int
-    estimated: tuple[int, ...]
+    estimated: Columns
     inputs: Sequence[Array]  # (n_samples, m)
     states: Sequence[Array]  # (n_samples, h)
 
@@ -180,10 +176,7 @@ def difference(u: Array, motion: Array, sizes: Array) -> float:
 
 
 def make_mean_profile(
-    training: TrainingSet,
-    measured: tuple[int, ...],
-    population: Population,
-    keys: Iterable[EpisodeKey],
+    training: TrainingSet, measured: Columns, population: Population, keys: Iterable[EpisodeKey]
 ) -> Baseline:
     """Average the states of training episodes that have the same motions, over units, and without each unit."""
     n, same = len(population.states), DEFAULT.same_motion
@@ -194,8 +187,10 @@ def make_mean_profile(
     means = unit_means(training, list(motions.values()), estimated, same)
     for key, of_units in zip(motions, means, strict=True):
         if len(of_units) < 2:
-            reason = f"the inputs of held-out {key} do not occur in training episodes of two units"
-            raise DataError(f"Mean profile: {reason}; they may differ by {100 * same:g} % of the largest (RMS).")
+            raise DataError(
+                f"Mean profile: the inputs of held-out {key} do not occur in training episodes of two units; they may "
+                f"differ by {100 * same:g} % of the largest (RMS)."
+            )
 
     def without(left_out: str) -> MeanProfile:
         states = [np.mean([p for unit, p in of_units.items() if unit != left_out], axis=0) for of_units in means]
@@ -208,7 +203,7 @@ def make_mean_profile(
 
 def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:
     """Return the inputs of episodes that differ, (n_samples, m) each."""
-    motions: dict[EpisodeKey, Array] = {}
+    motions = dict[EpisodeKey, Array]()
     for key in keys:
         u = population.read_parts(key)[1]
         sizes = largest_of([*motions.values(), u])

@@ -1,32 +1,32 @@
 """Certificates of observers for the uncertain set and as nonlinear systems, with errors and guards from training."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
-from ..core.errors import SynthesisError
-from ..core.lti import StateSpace, gain
-from ..core.rounding import TINY
-from ..data import EpisodeBatch
-from ..data.population import EpisodeKey
+from ..core import TINY, Array, Record, StateSpace, SynthesisError, frozen, gain
+from ..data import EpisodeBatch, EpisodeKey
 from ..evaluate.errors import error_rms
 from ..identify import ModelSet
-from ..loops.library import recursion
-from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, relift_certificate, run_observer
+from ..loops import recursion
+from ..observer import (
+    Observer,
+    ReliftCertificate,
+    ReliftScales,
+    ReliftStatus,
+    Screen,
+    factors,
+    one_step_residual,
+    relift_certificate,
+    run_observer,
+)
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound, linear_estimate
 from ..observer.estimator.gaps import losses
-from ..observer.residual import one_step_residual
 from ..observer.runtime import Guard
-from ..observer.screen import Screen
 from ..observer.simulate import run_observers
-from ..observer.units import factors
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import attained, certify_errors
 from ..uncertainty import UncertainModel
@@ -77,7 +77,7 @@ def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
 def certified_on(task: DesignTask) -> list[EpisodeBatch]:
     """Return the starts of the first episodes of units, all of short ones, and the same of other conditions."""
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
-    others: dict[str, list[EpisodeKey]] = {}
+    others = dict[str, list[EpisodeKey]]()
     for key in (k for k in task.recordings.keys if k.condition not in home and k.unit in units):
         others.setdefault(key.condition, []).append(key)
     batches = []
@@ -115,11 +115,9 @@ def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Part
     return observer.guard, replace(filter_certificate(observer, scales), scales=recorded), bound
 
 
-def _facts(
-    certificate: ReliftCertificate, bound: SignalBound, observer: Observer, errors: Sequence[float]
-) -> dict[str, Any]:
+def _facts(certificate: ReliftCertificate, bound: SignalBound, observer: Observer, errors: Sequence[float]) -> Record:
     """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
-    facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
+    facts: Record = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
     facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
     facts |= bound.facts(observer.measured) | {"assumptions": certificate.assumptions}
     recorded = bound.cover * factors(observer, {})[0][: len(bound.states)]
@@ -216,11 +214,11 @@ def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) ->
         return None, str(error)
 
 
-def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> dict[str, Any]:
+def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> Record:
     """Return what holds for an observer on every member of the set."""
     observer = design.observer
     order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
-    facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
+    facts: Record = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
     if design.facts.get("rows_fitted_to_single_steps"):
         reason = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
         return facts | {"reason": reason}
@@ -247,8 +245,10 @@ def require_useful(problem: ObserverProblem, observer: Observer, bound: float) -
     nothing = gain(np.zeros((problem.nominal.n_outputs, columns)), problem.nominal.dt)
     without = certify_errors(problem, problem.estimate_error(nothing), np.zeros(1))[0]
     if bound >= without:
-        both = f"the bound over the set is {bound:.3g}, and without an estimate {without:.3g}"
-        raise SynthesisError(f"{both}: the inputs of the set are independent, recorded ones are not.")
+        raise SynthesisError(
+            f"the bound over the set is {bound:.3g}, and without an estimate {without:.3g}: the inputs of the set are "
+            "independent, recorded ones are not."
+        )
 
 
 def error_maps(task: DesignTask, design: Design, problem: ObserverProblem) -> tuple[StateSpace, Array]:

@@ -6,8 +6,6 @@ rate on other motions (`bound_of_peaks`). It holds for units that move as those 
 observer was designed on the same units, new ones have larger innovations.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -16,13 +14,9 @@ from itertools import combinations, product
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, frozen
-from ..core.rounding import EPS, ITERATED, ROUNDING
-from ..core.work import Work
-from ..observer import Observer
-from ..observer.estimator.regression import spread
+from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen
+from ..observer import Observer, run_innovations, spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
-from ..observer.simulate import run_innovations
 from ..uncertainty.outliers.score import LEAST_SCORES, prediction_bound
 from .validation import TrainingSet
 
@@ -123,7 +117,7 @@ def steady(largest: Mapping[Group, Array], settings: MonitorSettings) -> Array:
     """Return weights of levels, shape (q, bands), whose mean differs least from unit to unit of a condition."""
     from scipy.optimize import nnls
 
-    by_condition: dict[str, list[Array]] = {}
+    by_condition = dict[str, list[Array]]()
     for (_, condition), levels in largest.items():
         by_condition.setdefault(condition, []).append(levels.ravel())
     apart = np.concatenate([np.array(levels) - np.mean(levels, axis=0) for levels in by_condition.values()])

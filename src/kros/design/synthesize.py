@@ -17,19 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
-from ..core.artifacts import plain
-from ..core.errors import ConfigError, SynthesisError
-from ..core.settings import require_kind
-from ..core.work import Work
-from ..data.population import scaling_of
-from ..identify import ModelSet
-from ..identify.identified import IdentifiedModels
+from ..core import Array, ByName, ConfigError, Record, SynthesisError, Work, frozen, plain, require_kind
+from ..data import scaling_of
+from ..identify import IdentifiedModels, ModelSet
 from ..lifting import Lifting
-from ..observer import EstimatorSettings, Sensor
-from ..observer.sensor import Sensors, require_measured
+from ..observer import EstimatorSettings, Sensor, Sensors, require_measured
 from ..observer.units import in_sizes
-from ..uncertainty.quantify import UncertainModels
+from ..uncertainty import UncertainModels
 from .certificates import certificate, certify, usable_problem
 from .methods import METHODS, methods_of, preferred, suitable
 from .monitor import fit_monitor
@@ -57,23 +51,16 @@ class Designs:
 
     designs: Mapping[str, Design]
     deployed: str
-    failed: Mapping[str, str]  # reasons
-    order: tuple[str, ...]
-
-    @property
-    def facts(self) -> dict[str, dict[str, Any]]:
-        """What the metrics say of every observer, designed or not."""
-        failed = {name: {"status": "failed", "reason": reason} for name, reason in self.failed.items()}
-        return {name: failed.get(name) or dict(self.designs[name].facts) for name in self.order}
+    facts: Mapping[str, ByName]  # what the metrics say of every observer, designed or not
 
 
 def synthesize(
     uncertain: UncertainModels,
     method: str | Method | None = None,
     *,
-    observer: Mapping[str, Any] | None = None,
-    estimator: Mapping[str, Any] | None = None,
-    sensor: Mapping[str, Any] | None = None,
+    observer: ByName | None = None,
+    estimator: ByName | None = None,
+    sensor: ByName | None = None,
     work: Work | None = None,
     **settings: Any,
 ) -> Design:
@@ -160,7 +147,8 @@ def synthesize_all(
         known = {"false_alarm_rate": monitor.false_alarm_rate, "units": monitor.units, "settle_samples": monitor.settle}
         facts = {**design.facts, "monitor": known}
         designs[deployed] = replace(design, observer=replace(design.observer, monitor=monitor), facts=facts)
-    return Designs(designs, deployed, failed, tuple(task.name for task in tasks))
+    reasons: dict[str, ByName] = {name: {"status": "failed", "reason": reason} for name, reason in failed.items()}
+    return Designs(designs, deployed, {t.name: reasons.get(t.name) or designs[t.name].facts for t in tasks})
 
 
 def _named(uncertain: UncertainModels, method: str | Method, estimator: EstimatorSettings) -> tuple[str, Method]:
@@ -231,7 +219,7 @@ def certified(
 ) -> dict[str, Design]:
     """Certify observers as nonlinear ones, a lifting side by side, and on the set with disturbances a method chose."""
     pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
-    groups: dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]] = {}
+    groups = dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]]()
     for task, design in pairs:
         groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
@@ -263,7 +251,7 @@ def choose_deployed(designs: Sequence[Design]) -> str:
     return best
 
 
-def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dict[str, Any]:
+def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> Record:
     """Return the object ``about`` of an observer's file, in the recordings' units."""
     population, known, calibration = identified.population, identified.facts, identified.calibration
     observer, certificate, facts = design.observer, design.certificate, design.facts
@@ -271,7 +259,7 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dic
     proof = {name: getattr(certificate, name) for name in ("certified", "reason", "gain", "assumptions")}
     trained = {"units": len(set(known.pooled) & set(task.models.unit_ids)), "conditions": identified.conditions}
     channels = (*population.states, *population.inputs)
-    content: dict[str, Any] = {
+    content: Record = {
         "kros": version("kros"),
         "units_of_measure": {c.name: c.unit for c in population.channels if c.name in identified.sizes},
         "largest_in_training": identified.sizes,
@@ -287,6 +275,6 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dic
     if calibration is not None and calibration.spec.parameter in observer.lifting.parameters:
         values = {name: getattr(calibration.spec, name) for name in ("angle", "ratio", "reference", "measured")}
         content["parameters"] = {calibration.spec.parameter: {**values, "lag_rad": calibration.lag_rad}}
-    names = (name for name in ("certified", "reason", "bound_percent", "outside") if f"set_{name}" in facts)
-    signals = {name: facts[f"set_{name}"] for name in names}
+    parts = ("certified", "reason", "bound_percent", "outside")
+    signals = {name: facts[f"set_{name}"] for name in parts if f"set_{name}" in facts}
     return dict(plain(content | ({"recorded_signals": signals} if signals else {})))

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
-from ..core.artifacts import load_artifact, loader, save_artifact
-from ..core.errors import SynthesisError
-from ..core.lti import gain
-from ..data.shown import Shown
+from ..core import Array, ByName, Names, Record, SynthesisError, frozen, gain, load_artifact, loader, save_artifact
+from ..data import Shown
 from ..identify import ModelSet
-from ..observer import Observer, ReliftCertificate, Runtime
-from ..observer.sensor import Sensors, delay_of
+from ..observer import Observer, ReliftCertificate, Runtime, Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .validation import TrainingSet, percent_of, rank
 
@@ -33,7 +29,7 @@ class Label:
     baseline: bool = False
 
 
-@dataclass(frozen=True)
+@frozen
 class Method(ABC):
     """One way to an observer; its options are fields."""
 
@@ -80,7 +76,7 @@ class Design(Shown):
     name: str
     observer: Observer
     synthesis: Synthesis
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    facts: ByName = field(default_factory=dict)
     certificate: ReliftCertificate | None = None
     problem: ObserverProblem | None = None
 
@@ -90,7 +86,7 @@ class Design(Shown):
         error = f"training error {percent:.3g} %" if finite else "diverges in training"
         return f"<Design {self.name}: {self.facts.get('order')} states in the correction, {error}, {known}>"
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         facts = self.facts
         rows = {f"bound of {state}, %": bound for state, bound in facts.get("set_bound_percent", {}).items()}
         rows |= {"training error, %": facts.get("hidden_error_percent"), "lower bound": self.lower_bound}
@@ -140,7 +136,7 @@ class DesignTask:
     noise: Array  # (q,)
     training: TrainingSet
     recordings: TrainingSet
-    covered: tuple[str, ...]
+    covered: Names
 
     def observer(self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None) -> Observer:
         """Return the observer of a synthesis, with the nominal model or another one."""
@@ -197,11 +193,6 @@ class DesignTask:
         ranks = [rank(error, limit, self.models.measured) for error in errors]
         first = min(range(len(ranks)), key=lambda i: ranks[i])
         return first, ranks[first][1]
-
-
-def is_robust(facts: Mapping[str, Any]) -> bool:
-    """Return whether the facts about an observer hold a certificate for the set of plants."""
-    return facts.get("worst_case_h2") is not None
 
 
 def split_name(observer: str) -> tuple[str, str]:

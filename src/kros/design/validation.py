@@ -8,17 +8,13 @@ from itertools import chain, zip_longest
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
-from ..core.rounding import TINY
-from ..data import EpisodeBatch
-from ..data.population import EpisodeKey, Population
+from ..core import TINY, Array, frozen
+from ..data import EpisodeBatch, EpisodeKey, Population
 from ..data.prepare import scale_population
 from ..evaluate.errors import error_rms, largest
 from ..evaluate.held_out import as_shown, observers_run
-from ..identify import ModelSet
-from ..identify.identified import IdentifiedModels
-from ..observer import Observer, Seen
-from ..observer.estimator.regression import spread
+from ..identify import IdentifiedModels, ModelSet
+from ..observer import Observer, Seen, spread
 from ..observer.sensor import Sensors, in_units
 
 
@@ -60,7 +56,7 @@ class TrainingSet:
         """Take all training episodes of pooled units, one of every unit and condition before the second of any."""
         facts = identified.facts
         parameters = {u: identified.parameters[u] for u in facts.pooled if u in models.unit_ids}
-        groups: dict[tuple[str, str], list[EpisodeKey]] = {}
+        groups = dict[tuple[str, str], list[EpisodeKey]]()
         for key in (key for unit in parameters for key in facts.keys("train", unit)):
             groups.setdefault((key.unit, key.condition), []).append(key)
         keys = tuple(k for turn in zip_longest(*groups.values()) for k in turn if k is not None)

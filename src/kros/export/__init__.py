@@ -15,7 +15,7 @@ Examples
 True
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 from .c99.compiled import CompiledObserver
 from .c99.numbers import LoadOutput
 from .c99.write import export_c

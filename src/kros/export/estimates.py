@@ -1,26 +1,22 @@
 """Estimates of a run as a table, CSV or Parquet, written block by block."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Bits
-from ..core.artifacts import write_json
-from ..data.population import EpisodeKey
-from ..observer.screen import SampleStatus
+from ..core import Array, Bits, Record, write_json
+from ..data import EpisodeKey
+from ..observer import SampleStatus
 
 Write = Callable[[EpisodeKey, int, Bits, Array], None]
 ENDINGS = (".parquet", ".csv")
 
 
 @contextmanager
-def writer(out: Path, period_s: float, facts: dict[str, Any]) -> Iterator[Write]:
+def writer(out: Path, period_s: float, facts: Record) -> Iterator[Write]:
     """Give a function that writes an episode from a sample on; the file appears whole or not at all.
 
     Names of CSV columns have the unit of measure in brackets.

@@ -1,12 +1,9 @@
 """Names from recordings as they stand in generated text: comments, Markdown, XML, identifiers of C."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
-from ..core.errors import ConfigError
+from ..core import ConfigError
 
 _ALLOWED = frozenset(" _-.,:;+()[]%/^=@°·²³")  # beside letters and digits of any script
 _C_WORDS = re.compile(
@@ -42,8 +39,10 @@ def plain_names(names: Iterable[str]) -> list[str]:
     names = list(names)
     shown = [plain(name) for name in names]
     if len(set(shown)) < len(names):
-        problem = f"Export: the names {', '.join(map(repr, names))} cannot be told apart in generated code"
-        raise ConfigError(f"{problem}; rename channels by letters and digits.")
+        raise ConfigError(
+            f"Export: the names {', '.join(map(repr, names))} cannot be told apart in generated code; rename channels "
+            "by letters and digits."
+        )
     return shown
 
 
@@ -61,14 +60,3 @@ def require_identifier(name: str, what: str = "name") -> str:
             "begins with a letter, and no word of C."
         )
     return name
-
-
-def rendered(
-    package: str, files: Mapping[str, str], context: Mapping[str, Any], filters: Mapping[str, Any]
-) -> dict[str, str]:
-    """Return the text of every file, by its name and that of its template in a package."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
-    environment.filters |= filters
-    return {file: environment.get_template(f"{template}.jinja").render(context) for file, template in files.items()}

@@ -20,13 +20,7 @@ if TYPE_CHECKING:
     from .pykoop import from_pykoop, to_pykoop
     from .sklearn_estimator import KoopmanRegressor
 
-__all__ = [
-    "KoopmanRegressor",
-    "from_control",
-    "from_pykoop",
-    "to_control",
-    "to_pykoop",
-]
+__all__ = ["KoopmanRegressor", "from_control", "from_pykoop", "to_control", "to_pykoop"]
 
 _HOME = dict.fromkeys(__all__, "control") | {"KoopmanRegressor": "sklearn_estimator"}
 _HOME |= dict.fromkeys(("from_pykoop", "to_pykoop"), "pykoop")

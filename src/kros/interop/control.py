@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import DataError, DimensionError, MissingDependencyError
-from ..core.lti import StateSpace
+from ..core import DataError, DimensionError, MissingDependencyError, StateSpace
 
 try:
     import control
@@ -67,8 +66,9 @@ def to_control(
         return [to_control(system[i], name=name, **signals) for i in range(system.batch_shape[0])]
     for (kind, names), count in zip(signals.items(), (system.n_states, system.n_inputs, system.n_outputs), strict=True):
         if names is not None and (isinstance(names, str) or not len(names) == len(set(names)) == count):
-            problem = f"{count} {kind} need as many different names, found {names!r}"
-            raise DimensionError(f"to_control: {problem}; correct the list.")
+            raise DimensionError(
+                f"to_control: {count} {kind} need as many different names, found {names!r}; correct the list."
+            )
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
     # Copies: python-control may change matrices in place. States that do nothing stay, since they carry names.
     matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
@@ -101,12 +101,15 @@ def from_control(system: Any) -> StateSpace:
     >>> from_control(control.tf([1.0], [1.0, -0.5], 0.01)).A.tolist()
     [[0.5]]
     """
-    if not isinstance(system, (control.StateSpace, control.TransferFunction)):
-        needs = "needs a control.StateSpace or control.TransferFunction"
-        raise DimensionError(f"from_control: {needs}, found {type(system).__name__}.")
+    if not isinstance(system, control.StateSpace | control.TransferFunction):
+        raise DimensionError(
+            f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}."
+        )
     if system.dt is None or system.dt is True:
-        advice = "give it in seconds, control.ss(A, B, C, D, 0.001), or 0"
-        raise DimensionError(f"from_control: the sampling period is not known (dt = {system.dt}); {advice}.")
+        raise DimensionError(
+            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, "
+            "C, D, 0.001), or 0."
+        )
     system = _realised(system) if isinstance(system, control.TransferFunction) else system
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
     return StateSpace(A, B, C, D, float(system.dt))
@@ -120,8 +123,9 @@ def _realised(model: Any) -> Any:
         try:
             entry = control.ss(control.tf(model.num[i][j], model.den[i][j], model.dt))
         except ValueError as error:
-            problem = f"entry ({i}, {j}) of the transfer function is improper"
-            raise DataError(f"from_control: {problem}; give a causal model.") from error
+            raise DataError(
+                f"from_control: entry ({i}, {j}) of the transfer function is improper; give a causal model."
+            ) from error
         total = total + rows[:, [i]] * entry * columns[[j]]
     return total
 

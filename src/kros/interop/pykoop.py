@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
-from ..core.errors import DataError
-from ..data.population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role
+from ..core import Array, ArrayLike, DataError
+from ..data import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role
 from ..data.readers.arrays import as_numbers, from_arrays
 
 
@@ -51,24 +50,29 @@ def from_pykoop(
     try:
         arrays = {str(u): as_numbers(x) for u, x in (X if isinstance(X, Mapping) else {"0": X}).items()}
     except (TypeError, ValueError, RecursionError) as error:
-        needs = "needs an array of numbers (n_samples, n_columns) a unit"
-        raise DataError(f"from_pykoop: {needs}, found something else ({error}); correct it.") from error
+        raise DataError(
+            f"from_pykoop: needs an array of numbers (n_samples, n_columns) a unit, found something else ({error}); "
+            "correct it."
+        ) from error
     widths = {x.shape[1] if x.ndim == 2 else 0 for x in arrays.values()}
     n_states = min(widths, default=0) - 1 - n_inputs
-    if len(widths) != 1 or not isinstance(n_inputs, (int, np.integer)) or n_inputs < 0 or n_states < 1:
-        needs = f"needs arrays (n_samples, 1 + states + {n_inputs}) of one width"
-        raise DataError(f"from_pykoop: {needs}, found widths {sorted(widths)}; check n_inputs.")
+    if len(widths) != 1 or not isinstance(n_inputs, int | np.integer) or n_inputs < 0 or n_states < 1:
+        raise DataError(
+            f"from_pykoop: needs arrays (n_samples, 1 + states + {n_inputs}) of one width, found widths "
+            f"{sorted(widths)}; check n_inputs."
+        )
     if channels is None:
         states = [Channel(f"x{i}", Role.STATE, measured=True) for i in range(n_states)]
         channels = [*states, *(Channel(f"u{i}", Role.INPUT) for i in range(n_inputs))]
-    episodes: dict[EpisodeKey, Array] = {}
+    episodes = dict[EpisodeKey, Array]()
     for unit, x in arrays.items():
         ids = x[:, 0]
         bad = np.flatnonzero((ids % 1 != 0) | (np.abs(ids) >= 2.0**53))
         if bad.size:
-            wanted = "the first column should number the episodes (below 2**53)"
-            actual = f"found {ids[bad[0]]} in row {bad[0]} of unit {unit}"
-            raise DataError(f"from_pykoop: {wanted}, {actual}; correct it.")
+            raise DataError(
+                f"from_pykoop: the first column should number the episodes (below 2**53), found {ids[bad[0]]} in row "
+                f"{bad[0]} of unit {unit}; correct it."
+            )
         episodes |= {EpisodeKey(unit, DEFAULT_CONDITION, str(int(i))): x[ids == i, 1:] for i in np.unique(ids)}
     return from_arrays(episodes, channels, sample_period_s)
 

@@ -11,9 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core.arrays import Array, Whole
-from ..core.errors import ConfigError, DataError, IdentificationError, MissingDependencyError
-from ..core.rounding import ROUNDING
+from ..core import ROUNDING, Array, ConfigError, DataError, IdentificationError, MissingDependencyError, Whole
 from ..identify import edmd, free_run
 from ..identify.edmd import relative_pivots
 from ..identify.factors import triangular
@@ -122,30 +120,36 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         far = self.horizon is None or self.horizon >= 1
         if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf or not far:
-            needs = "functions should be a list of texts, alpha at least zero and horizon at least one or None"
-            actual = f"found {self.functions!r}, {self.alpha!r}, {self.horizon!r}"
-            raise ConfigError(f"KoopmanRegressor: {needs}, {actual}.")
+            raise ConfigError(
+                "KoopmanRegressor: functions should be a list of texts, alpha at least zero and horizon at least one "
+                f"or None, found {self.functions!r}, {self.alpha!r}, {self.horizon!r}."
+            )
         values, edges = self._read(X, reset=True)
         checked = {"dtype": np.float64, "ensure_2d": False, "input_name": "y", "estimator": self}
         target = None if y is None else check_array(y, **checked)
         self._one_dimensional = target is not None and target.ndim == 1
         after = None if target is None else target.reshape(len(target), -1)
         if after is not None and len(after) != len(values):
-            problem = f"X has {len(values)} rows and y has {len(after)}"
-            raise DataError(f"{problem}; y holds the next state of every row of X.")
+            raise DataError(
+                f"X has {len(values)} rows and y has {len(after)}; y holds the next state of every row of X."
+            )
         self._name_columns(X, values.shape[1], None if after is None else after.shape[1])
         before, n = values, len(self.state_names_)
         if after is None:
             if np.diff(edges).min() < 2:
-                problem = "an episode has n_samples = 1, a transition needs at least 2"
-                raise DataError(f"KoopmanRegressor: {problem}; leave the episode out.")
+                raise DataError(
+                    "KoopmanRegressor: an episode has n_samples = 1, a transition needs at least 2; leave the episode "
+                    "out."
+                )
             now = np.delete(np.arange(len(values)), edges[1:] - 1)
             before, after = values[now], values[now + 1, :n]
         with np.errstate(all="ignore"):
             rows = np.concatenate([self.lifting_.lift(before[:, :n]), before[:, n:], self.lifting_.lift(after)], axis=1)
         if not np.isfinite(rows).all():
-            problem = "a lifted function of X is NaN or inf in some row"
-            raise DataError(f"KoopmanRegressor: {problem}; choose functions that are defined everywhere.")
+            raise DataError(
+                "KoopmanRegressor: a lifted function of X is NaN or inf in some row; choose functions that are "
+                "defined everywhere."
+            )
         R, names = triangular(rows), (*self.lifting_.names, *self.input_names_)
         if self.alpha == 0:
             _require_excited(R[: len(names), : len(names)], names, len(rows))
@@ -183,8 +187,10 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         if y is not None:
             if self.horizon != 1:
-                problem = f"pairs of rows (X, y) allow one step, the horizon is {self.horizon}"
-                raise DataError(f"score: {problem}; leave out y, or set horizon = 1.")
+                raise DataError(
+                    f"score: pairs of rows (X, y) allow one step, the horizon is {self.horizon}; leave out y, or set "
+                    "horizon = 1."
+                )
             return _r2(np.asarray(y, dtype=float), self.predict(X))
         values, edges = self._read(X, reset=False)
         n, row = len(self.state_names_), np.arange(len(values))
@@ -217,15 +223,19 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.episode_feature:
             ids, values = values[:, 0], values[:, 1:]
         if not values.shape[1]:
-            problem = "rows hold no state beside the episode"
-            raise DataError(f"KoopmanRegressor: {problem}; add the columns of states and inputs.")
+            raise DataError(
+                "KoopmanRegressor: rows hold no state beside the episode; add the columns of states and inputs."
+            )
         if not reset and values.shape[1] != len(self.state_names_) + len(self.input_names_):
-            problem = f"found {values.shape[1]} columns beside the episode"
-            raise DataError(f"KoopmanRegressor: {problem}; pass rows in the layout of `fit`.")
+            raise DataError(
+                f"KoopmanRegressor: found {values.shape[1]} columns beside the episode; pass rows in the layout of "
+                "`fit`."
+            )
         inner = np.zeros(0, dtype=np.int64) if ids is None else np.flatnonzero(ids[1:] != ids[:-1]) + 1
         if ids is not None and len(set(ids[[0, *inner]].tolist())) <= len(inner):
-            problem = "an episode stands in several places"
-            raise DataError(f"KoopmanRegressor: {problem}; keep its rows together and in order of time.")
+            raise DataError(
+                "KoopmanRegressor: an episode stands in several places; keep its rows together and in order of time."
+            )
         return values, np.concatenate([[0], inner, [len(values)]]).astype(np.int64)
 
     def _name_columns(self, X: Any, n_columns: int, n_targets: int | None) -> None:
@@ -236,20 +246,25 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         n = declared[0] if declared else n_columns
         if set(declared) - {n} or not 1 <= n <= n_columns:
             targets = f" and y with {n_targets} columns" if n_targets is not None else ""
-            problem = f"does not agree with n_inputs = {self.n_inputs}, states = {self.states}{targets}"
-            raise DataError(f"X has {n_columns} columns of states and inputs, which {problem}.")
+            raise DataError(
+                f"X has {n_columns} columns of states and inputs, which does not agree with n_inputs = "
+                f"{self.n_inputs}, states = {self.states}{targets}."
+            )
         named = hasattr(X, "iloc") and all(isinstance(c, str) for c in X.columns)
         frame = list(X.columns)[-n_columns:] if named else []
         names = frame or [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(n_columns - n)]
         self.state_names_ = tuple(names[:n] if self.states is None else self.states)
         self.input_names_ = tuple(names[n:])
         if frame and self.state_names_ != tuple(frame[:n]):
-            problem = f"The states are {self.state_names_}, the frame has the columns {frame}"
-            raise DataError(f"{problem}; put the states first, the inputs after them.")
+            raise DataError(
+                f"The states are {self.state_names_}, the frame has the columns {frame}; put the states first, the "
+                "inputs after them."
+            )
         self.lifting_ = Lifting(self.state_names_, tuple(self.functions), (), self.input_names_)
         if self.lifting_.history:
-            problem = "rows stand by themselves, functions cannot read earlier samples"
-            raise ConfigError(f"KoopmanRegressor: {problem}; use kros.identify.")
+            raise ConfigError(
+                "KoopmanRegressor: rows stand by themselves, functions cannot read earlier samples; use kros.identify."
+            )
 
     def __sklearn_tags__(self) -> Any:
         """Return scikit-learn's facts about the estimator: no target is needed."""
@@ -261,17 +276,22 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 def _require_excited(R: Array, names: Sequence[str], n_pairs: int) -> None:
     """Name the first column that plain least squares cannot tell from those before it."""
     if n_pairs < len(names):
-        problem = f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B]"
-        raise DataError(f"{problem}; record more, or use alpha > 0.")
+        raise DataError(
+            f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B]; record more, or "
+            "use alpha > 0."
+        )
     dependent = np.flatnonzero(relative_pivots(R) <= ROUNDING)
     if dependent.size:
-        problem = f"With alpha = 0 {names[int(dependent[0])]!r} cannot be identified"
-        reason = "it depends on the columns before it, or is zero"
-        raise IdentificationError(f"{problem}: {reason}; remove it, excite it, or use alpha > 0.")
+        raise IdentificationError(
+            f"With alpha = 0 {names[int(dependent[0])]!r} cannot be identified: it depends on the columns before it, "
+            "or is zero; remove it, excite it, or use alpha > 0."
+        )
 
 
 def _r2(truth: Array, predicted: Array) -> float:
     if len(truth) < 2:
-        problem = f"found {len(truth)} samples to compare with, R2 needs 2"
-        raise DataError(f"score: {problem}; pass longer episodes, or lower the horizon.")
+        raise DataError(
+            f"score: found {len(truth)} samples to compare with, R2 needs 2; pass longer episodes, or lower the "
+            "horizon."
+        )
     return float(r2_score(truth, predicted)) if np.isfinite(predicted).all() else -np.inf

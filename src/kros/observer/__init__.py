@@ -15,14 +15,16 @@ from ..core.removed import refusing
 from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
 from .estimator.build import identify_estimator
-from .estimator.regression import Recordings
+from .estimator.regression import Recordings, spread
 from .estimator.settings import EstimatorSettings
 from .observer import Observer
+from .residual import like_measurement_noise, one_step_covariance, one_step_residual
 from .running import Estimate, RunningObserver
 from .runtime import Runtime, Seen
-from .screen import SampleStatus
-from .sensor import Sensor
-from .simulate import run_observer
+from .screen import SampleStatus, Screen, screened
+from .sensor import Sensor, Sensors, delay_of, require_measured
+from .simulate import run_innovations, run_observer
+from .units import factors, recorded_channel, recorded_factors
 
 __all__ = [
     "Estimate",

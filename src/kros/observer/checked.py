@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import DataError
+from ..core import DataError
 
 LARGEST = float(np.finfo(float).max)
 RANGES = {

@@ -21,12 +21,22 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Parameters, frozen
-from ..core.errors import ConfigError, DimensionError
+from ..core import (
+    ITERATED,
+    Array,
+    ArrayLike,
+    ByName,
+    Columns,
+    ConfigError,
+    DimensionError,
+    Names,
+    Parameters,
+    Record,
+    StateSpace,
+    frozen,
+    member,
+)
 from ..core.linalg import balanced_size
-from ..core.lti import StateSpace
-from ..core.rounding import ITERATED
-from ..core.settings import member
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .filter_bank import FilterBank
@@ -86,8 +96,8 @@ class ObserverData:
     lifting: Lifting
     A: Array
     B: Array
-    measured: tuple[int, ...]
-    inputs: tuple[str, ...]
+    measured: Columns
+    inputs: Names
     controller: StateSpace
     injection: Injection
     sample_period_s: float
@@ -98,7 +108,7 @@ class ObserverData:
     monitor: Monitor | None = None
     bank: FilterBank | None = None
     guard: Guard | None = None
-    about: Mapping[str, Any] = field(default_factory=dict)
+    about: ByName = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "injection", member(Injection, self.injection, f"Observer {self.name}: the injection"))
@@ -183,7 +193,7 @@ class ObserverData:
         return np.vstack([plant, controller])
 
     @property
-    def recorded(self) -> tuple[str, ...]:
+    def recorded(self) -> Names:
         """States that recordings hold: all but the internal ones."""
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
@@ -204,7 +214,7 @@ class ObserverData:
         """Return those parameters of many that the lifting has."""
         return {name: parameters[name] for name in self.lifting.parameters if name in parameters}
 
-    def values(self, parameters: Parameters | None = None, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
+    def values(self, parameters: Parameters | None = None, shape: tuple[int, ...] | None = None) -> Record:
         """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`."""
         known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
         given = {name: np.asarray(values[name], dtype=float) for name in known if values.get(name) is not None}

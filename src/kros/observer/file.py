@@ -7,7 +7,6 @@ warning: everything below is checked either way.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,19 +14,14 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, create_model
 
+from ..core import ByName, DataError, KrosError, Record, Settings, StateSpace, shortened
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
-from ..core.errors import DataError, KrosError
-from ..core.files import shortened
-from ..core.lti import StateSpace
-from ..core.settings import Settings
 from ..lifting import Lifting
 from .data import ObserverData
 from .filter_bank import FilterBank
 from .monitor import Monitor
 from .runtime import Guard, Runtime, Seen
 from .sensor import Sensor
-
-Content = dict[str, Any]  # of JSON
 
 log = logging.getLogger(__name__)
 SCHEMA, KIND = 3, "observer"
@@ -70,21 +64,15 @@ class _Controller(_Model):
 
 def _part(kind: Any) -> Any:
     """Return what the file holds of a part whose fields are numbers, arrays of them, or numbers by name."""
-    types: Content = {"Array": Row | Matrix, "Array | None": Limits, "float": float, "int": int}
-    held: Content = {}
+    types: Record = {"Array": Row | Matrix, "Array | None": Limits, "float": float, "int": int}
+    held = Record()
     for f in fields(kind):
         needed = f.default is MISSING and f.default_factory is MISSING
         held[f.name] = (types[str(f.type)], ...) if needed else (types[str(f.type)] | None, None)
     return create_model(f"_{kind.__name__}", __base__=_Part, **held)
 
 
-_PARTS: Content = {
-    "runtime": Runtime,
-    "seen": Seen,
-    "filter_bank": FilterBank,
-    "guard": Guard,
-    "monitor": Monitor,
-}
+_PARTS: Record = {"runtime": Runtime, "seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
 
 
 def _field(key: str) -> str:
@@ -106,15 +94,15 @@ class _File(_Part):
     sample_period_s: float = Field(gt=0)
     model: _Model
     controller: _Controller
-    sensor: Content = Field(default_factory=dict)
-    about: Content = Field(default_factory=dict)
+    sensor: Record = Field(default_factory=dict)
+    about: Record = Field(default_factory=dict)
 
 
-_KINDS: Content = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
+_KINDS: Record = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
 _Whole = create_model("_Whole", __base__=_File, **_KINDS)
 
 
-def observer_content(observer: ObserverData) -> Content:
+def observer_content(observer: ObserverData) -> Record:
     """Return what the file of an observer holds, without its checksum."""
     lifting = observer.lifting
     parts = {key: getattr(observer, _field(key)) for key in _PARTS}
@@ -138,7 +126,7 @@ def observer_content(observer: ObserverData) -> Content:
         "sensor": {name: sensor.model_dump() for name, sensor in observer.sensor.items()},
         "about": observer.about,
     }
-    written: Content = plain(content)
+    written: Record = plain(content)
     return {key: value for key, value in written.items() if value or key not in _PERHAPS}
 
 
@@ -163,7 +151,7 @@ def read_observer(path: Path) -> ObserverData:
         return _checked(content, f"Loading an observer from {path}")
 
 
-def _checked(content: Mapping[str, Any], where: str) -> ObserverData:
+def _checked(content: ByName, where: str) -> ObserverData:
     """Return the observer of a file's content."""
     try:
         rest = {key: value for key, value in content.items() if key not in ("schema", "kind", CHECKSUM)}
@@ -172,7 +160,7 @@ def _checked(content: Mapping[str, Any], where: str) -> ObserverData:
         raise DataError(f"{where}: {error} Correct the file.") from error
 
 
-def _observer(content: Mapping[str, Any]) -> ObserverData:
+def _observer(content: ByName) -> ObserverData:
     names = [*content["states"], *content["inputs"], *content["parameters"]]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise DataError(
@@ -210,6 +198,6 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
     )
 
 
-def _given(fields: Mapping[str, Any]) -> Content:
+def _given(fields: ByName) -> Record:
     """Return the fields that are not null."""
     return {name: value for name, value in fields.items() if value is not None}

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, frozen
+from ..core import Array, Columns, Flags, Record, frozen
 from .checked import floats
 
 
@@ -61,7 +61,7 @@ def longest_age(half: Array) -> Array:
 class Gaps:
     """State of the gaps of filter banks over a batch of machines."""
 
-    def __init__(self, bank: FilterBank, A: Array, measured: tuple[int, ...], recorded: int, batch: int) -> None:
+    def __init__(self, bank: FilterBank, A: Array, measured: Columns, recorded: int, batch: int) -> None:
         n, q = len(A), len(measured)
         self.bank, self.measured, self.recorded = bank, list(measured), recorded
         self.filters = slice(recorded, recorded + bank.filters)
@@ -115,7 +115,7 @@ class Gaps:
         self.offset[...], self.age[...], self.count[...] = offset, age, count
 
     @property
-    def job(self) -> dict[str, Any]:
+    def job(self) -> Record:
         """What the compiled loop needs of gaps."""
         bank = self.bank
         rows = bank.forget, bank.half, bank.recovery, longest_age(bank.half)

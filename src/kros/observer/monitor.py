@@ -24,8 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, Flags, frozen
-from ..core.errors import DataError
+from ..core import AnyArray, Array, DataError, Flags, frozen
 from .checked import floats
 
 LARGEST = 1e3  # sizes of the innovation that count at most

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Parameters
-from ..core.lti import gain
-from ..data.shown import Shown
+from ..core import Array, ArrayLike, Columns, Names, Parameters, Record, gain
+from ..data import Shown
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .data import ObserverData
@@ -35,7 +34,7 @@ class Observer(Shown, ObserverData):
     0.2
     """
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         order = f"{self.controller.n_states} of the correction, {self.internal} internal states"
         rows = {"name": self.name, "states": ", ".join(self.recorded), "measured": ", ".join(self.outputs)}
         rows |= {"inputs": ", ".join(self.inputs), "functions": ", ".join(self.lifting.functions), "order": order}
@@ -48,8 +47,8 @@ class Observer(Shown, ObserverData):
         lifting: Lifting,
         A: Array,
         B: Array,
-        measured: tuple[int, ...],
-        inputs: tuple[str, ...],
+        measured: Columns,
+        inputs: Names,
         sample_period_s: float,
     ) -> Self:
         """Return the nominal model without any correction."""

@@ -28,13 +28,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike, Parameters, frozen
-from ..core.errors import DataError
-from ..core.rounding import TINY
+from ..core import TINY, AnyArray, Array, ArrayLike, Columns, DataError, Parameters, Record, frozen
 from ..data import EpisodeBatch
 from ..lifting import Lifting
 from ..synthesis.residual_shaped.residual_h2 import ResidualProblem, promised_errors
@@ -106,7 +103,7 @@ def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], 
         )
     size -= size % 2
     x = [residual[:length, i].T for i, length in enumerate(lengths.tolist())]
-    options: dict[str, Any] = {"nperseg": size, "detrend": False, "return_onesided": False}
+    options: Record = {"nperseg": size, "detrend": False, "return_onesided": False}
     total = np.moveaxis(
         np.array([csd(one[None], one[:, None], **options)[1][..., : size // 2 + 1] for one in x]), -1, 1
     )
@@ -183,7 +180,7 @@ def residual_models(
     return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], TINY)))))
 
 
-def _choices(measured: tuple[int, ...], hidden: Sequence[int]) -> list[tuple[int, ...]]:
+def _choices(measured: Columns, hidden: Sequence[int]) -> list[tuple[int, ...]]:
     others = [i for i in hidden if i not in measured]
     sizes = range(len(others) + 1) if len(others) <= _MOST_HIDDEN else (0, len(others))
     return [(), *(tuple(sorted(measured + some)) for size in sizes for some in combinations(others, size))]

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike
-from ..core.errors import DimensionError
+from ..core import AnyArray, Array, ArrayLike, DimensionError, Names
 from .data import ObserverData
 from .monitor import Watch
 from .screen import LONGEST, Held, SampleStatus, Screen, Screened
@@ -85,7 +84,7 @@ class RunningObserver:
         self.reset(y)
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> Names:
         """Names of the estimated states, in order."""
         return self.observer.lifting.states
 

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
-from ..core.errors import DataError
+from ..core import Array, DataError, frozen
 from .checked import floats
 
 

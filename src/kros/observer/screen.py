@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core import DimensionError
 from ..core.arrays import Array, ArrayLike, Bits, Flags, Index, frozen
-from ..core.errors import DimensionError
 from .data import ObserverData
 from .runtime import Seen
 

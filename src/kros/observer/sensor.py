@@ -15,8 +15,7 @@ from collections.abc import Mapping, Sequence
 
 from pydantic import Field
 
-from ..core.errors import ConfigError
-from ..core.settings import Settings
+from ..core import ConfigError, Settings
 
 
 class Sensor(Settings):

@@ -13,11 +13,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..core.arrays import Array
-from ..core.lti import StateSpace
+from ..core import AGREED, Array, StateSpace
 from ..core.norms import gramian
-from ..core.rounding import AGREED
-from ..loops.library import recursion
+from ..loops import recursion
 from .data import ObserverData
 
 BLOCK = 4096  # samples of an impulse response that are in memory

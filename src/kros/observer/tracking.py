@@ -25,8 +25,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Flags, Whole
-from ..core.errors import ConfigError
+from ..core import Array, ArrayLike, ConfigError, Flags, Whole
 from .data import ObserverData
 from .simulate import run_observer
 from .step import Steps

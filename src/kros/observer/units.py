@@ -13,11 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..core.arrays import Array
-from ..core.errors import DataError
-from ..core.files import shortened
-from ..core.lti import StateSpace
-from ..core.rounding import ROUNDING, TINY
+from ..core import ROUNDING, TINY, Array, DataError, StateSpace, shortened
 from ..data.measures import unit_of_factor
 from ..synthesis.result import Injection
 from .data import ObserverData
@@ -112,7 +108,7 @@ def recorded_factors(observer: ObserverData, names: Sequence[str]) -> Array:
 
 def _factor(observer: ObserverData, name: str, value: Any) -> float:
     """Return a factor that a number of the file can be."""
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not abs(value) < 1 / TINY or not abs(value) > TINY:
         raise DataError(
             f"Observer {observer.name}: the factor of {name!r} should be a finite number other than zero, found "

@@ -14,6 +14,6 @@ Examples
 'linear'
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 
 __getattr__ = refusing(__name__)

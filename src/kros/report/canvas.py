@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ..core.arrays import AnyArray, ArrayLike
+from ..core import AnyArray, ArrayLike, Record
 from .names import RAISED, minus
 from .theme import DRAWING
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 else:  # for annotations alone: matplotlib is imported when something is drawn
     Artist = Axes = Figure = Any
 
+Captioned = tuple[Figure, str]  # a figure and more of its caption
 _PREFIXES = "pnµm kMG"  # powers of a thousand, from 10⁻¹²
 
 
@@ -35,14 +36,6 @@ def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, AnyArray]:
     for panel in panels.ravel():
         engineering(panel.yaxis)
     return figure, panels
-
-
-def settle(figure: Figure) -> None:
-    """Lay a figure out once; otherwise every file written from it would do so again."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-        figure.set_layout_engine(None)
 
 
 def engineering(axis: Axis) -> None:
@@ -71,7 +64,7 @@ def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
 
 def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float], **options: Any) -> None:
     """Write a small text at a place in shares of the axes, moved by an offset in points."""
-    settings: dict[str, Any] = {"xycoords": "axes fraction", "size": "small"} | options
+    settings: Record = {"xycoords": "axes fraction", "size": "small"} | options
     axes.annotate(text, at, xytext=offset, textcoords="offset points", **settings)
 
 
@@ -152,6 +145,12 @@ def units_axis(axes: Axes, units: Sequence[str]) -> None:
         axes.set_xlabel("unit")
     else:
         axes.set_xlabel(f"{len(units)} units, in order")
+
+
+def set_titles(axes: Iterable[Axes], titles: Iterable[str]) -> None:
+    """Write the titles of a row of panels."""
+    for panel, title in zip(axes, titles, strict=False):
+        panel.set_title(title)
 
 
 def label_below(axes: Iterable[Axes], text: str = "frequency (Hz)") -> None:

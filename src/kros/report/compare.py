@@ -1,17 +1,14 @@
 """Runs beside each other: settings and data in which they differ, and what they lead to, from settings and metrics."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from ..core import ByName, Record
 from .content import Column, Section, build
 from .facts import Facts
 from .names import number
 from .verdict import judge
 
-Settings = Mapping[str, Any]
-Rows = dict[str, Any]  # values by what they are of
 _WORDS = ("settings", "data", "deployed")  # topics whose values are texts
 TITLES = {
     "settings": "Settings that differ",
@@ -23,13 +20,13 @@ TITLES = {
 }
 
 
-def comparison(runs: Mapping[str, tuple[Settings, Facts]]) -> dict[str, dict[str, list[Any]]]:
+def comparison(runs: Mapping[str, tuple[ByName, Facts]]) -> dict[str, dict[str, list[Any]]]:
     """Return what is compared: by topic, and by name a value of every run, None where a run has none.
 
     Parameters
     ----------
     runs : mapping of str to (mapping, Facts)
-        Settings and metrics of every run.
+        ByName and metrics of every run.
     """
     settings, facts = [dict(flat(study)) for study, _ in runs.values()], [of for _, of in runs.values()]
     compared = {name: values for name, values in side_by_side(settings).items() if len(set(values)) > 1}
@@ -37,7 +34,7 @@ def comparison(runs: Mapping[str, tuple[Settings, Facts]]) -> dict[str, dict[str
     return {"settings": compared, **{topic.__name__: side_by_side([topic(of) for of in facts]) for topic in topics}}
 
 
-def side_by_side(of_runs: Sequence[Rows]) -> dict[str, list[Any]]:
+def side_by_side(of_runs: Sequence[Record]) -> dict[str, list[Any]]:
     """Return a value of every run by name, without names that no run knows."""
     names = dict.fromkeys(name for rows in of_runs for name, value in rows.items() if value not in (None, ""))
     return {name: [rows.get(name) for rows in of_runs] for name in names}
@@ -62,7 +59,7 @@ def change(first: Any, last: Any) -> str | None:
     return f"{'+' if last >= first else ''}{number(100 * (last / first - 1))} %"
 
 
-def flat(content: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
+def flat(content: ByName, before: str = "") -> Iterator[tuple[str, str]]:
     """Yield all settings by dotted names, as text."""
     for name, value in content.items():
         if isinstance(value, Mapping):
@@ -76,14 +73,14 @@ def text(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-def data(facts: Facts) -> Rows:
+def data(facts: Facts) -> Record:
     """Return what was recorded."""
     aside = sum(row.get("group") == "outliers" for row in facts.get("units", ()))
     study = {name: value for name, value in facts.study.items() if name not in ("deployed", "alerts")}
     return dict(flat(study | {"units_set_aside": aside}))
 
 
-def deployed(facts: Facts) -> Rows:
+def deployed(facts: Facts) -> Record:
     """Return which observer is deployed, and what is said of it."""
     verdict = judge(facts)
     return {
@@ -96,9 +93,9 @@ def deployed(facts: Facts) -> Rows:
     }
 
 
-def errors(facts: Facts) -> Rows:
+def errors(facts: Facts) -> Record:
     """Return mean and worst errors of all observers in the channels that are not measured."""
-    rows: Rows = {}
+    rows = Record()
     for table in facts.tables:
         where = f", {table.condition}" if len(facts.tables) > 1 else ""
         for name, cells in table.cells.items():
@@ -108,9 +105,9 @@ def errors(facts: Facts) -> Rows:
     return rows
 
 
-def weights(facts: Facts) -> Rows:
+def weights(facts: Facts) -> Record:
     """Return form, nominal and weights of every kind of model."""
-    rows: Rows = {}
+    rows = Record()
     for kind, found in facts.get("uncertainty", {}).items():
         weight = found.get("weight", {})
         rows |= {
@@ -125,9 +122,9 @@ def weights(facts: Facts) -> Rows:
     return rows | ({"units flagged": text(flagged) or "none"} if rows else {})
 
 
-def certificates(facts: Facts) -> Rows:
+def certificates(facts: Facts) -> Record:
     """Return bounds over the set of plants, worst-case H2 and gains at run time of all observers."""
-    rows: Rows = {}
+    rows = Record()
     for name, entry in facts.observers.items():
         bounds = entry.get("set_bound_percent") or {}
         rows |= {f"{name}: {c}": bound for c, bound in bounds.items() if c not in facts.measured}

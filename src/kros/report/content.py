@@ -3,20 +3,18 @@
 To add a column to a table, add one `Column` where the section builds it: a title and one value a row.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from math import isfinite
 from typing import Any
 
+from ..core import frozen
 from .names import number
 
 Pairs = Sequence[tuple[str, Sequence[str]]]
 
 
-@dataclass(frozen=True)
+@frozen
 class Column:
     """A column of a table before it is formatted; one in which nothing is known is left out."""
 
@@ -27,7 +25,7 @@ class Column:
     notes: Sequence[str] = ()  # small text below each value
 
 
-@dataclass(frozen=True)
+@frozen
 class Cell:
     """A cell of a table."""
 
@@ -37,7 +35,7 @@ class Cell:
     value: float | None = None  # what the cell is sorted by; its text by default
 
 
-@dataclass(frozen=True)
+@frozen
 class Table:
     """A table as the template shows it; the first column names the rows."""
 
@@ -52,7 +50,7 @@ class Table:
     prose: bool = False  # whether cells hold sentences
 
 
-@dataclass(frozen=True)
+@frozen
 class Section:
     """A section of the report: paragraphs, a list of terms, tables, and one figure."""
 

@@ -1,19 +1,18 @@
 """Errors of observers by channel and condition, from the rows of ``metrics.json``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 
-from ..data.population import natural_key
+from ..core import ByName, Names, frozen
+from ..data import natural_key
 
-Rows = Sequence[Mapping[str, Any]]
+Rows = Sequence[ByName]
 
 
-@dataclass(frozen=True)
+@frozen
 class ErrorCell:
     """Error of an observer in a channel, percent of the largest value; None where an estimate diverged."""
 
@@ -26,12 +25,12 @@ class ErrorCell:
     means: Mapping[str, float] = field(default_factory=dict)  # over units, of what all have, by its key in the metrics
 
 
-@dataclass(frozen=True)
+@frozen
 class ErrorTable:
     """Errors of all observers in one condition."""
 
     condition: str
-    channels: tuple[str, ...]
+    channels: Names
     cells: Mapping[str, Mapping[str, ErrorCell]]
 
     def hidden(self, measured: Sequence[str], observer: str | None = None) -> list[str]:
@@ -47,7 +46,7 @@ class ErrorTable:
         return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), np.finfo(float).tiny)))))
 
 
-def error_tables(metrics: Mapping[str, Any]) -> list[ErrorTable]:
+def error_tables(metrics: ByName) -> list[ErrorTable]:
     """Return a table a condition of the units that took part, the condition that was identified on first."""
     rows = [r for r in metrics.get("evaluation", []) if r["role"] in ("nominal", "off_nominal")]
     others = [r for r in rows if r["role"] == "off_nominal"] or rows
@@ -61,7 +60,7 @@ def tables_of(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None 
     """Return rows of errors by condition, observer and channel."""
     tables, known = [], intervals or {}
     for condition in sorted({r["condition"] for r in rows}, key=lambda c: (c != identify_on, natural_key(c))):
-        grouped: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
+        grouped = dict[str, dict[str, list[ByName]]]()
         for row in (r for r in rows if r["condition"] == condition):
             grouped.setdefault(row["observer"], {}).setdefault(row["channel"], []).append(row)
         cells = {

@@ -1,43 +1,39 @@
 """``metrics.json`` with what verdict and sections ask of it; any part but ``study`` may be absent."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from ..core import ByName, Names, frozen
 from ..design.task import split_name
 from .error_tables import ErrorTable, error_tables
 from .names import observer_label, readable_unit
 
 
-@dataclass(frozen=True)
+@frozen
 class Facts:
     """The metrics of one run."""
 
-    metrics: Mapping[str, Any]
+    metrics: ByName
 
     def get(self, name: str, otherwise: Any = None) -> Any:
         """Return a part of the metrics, or what is given otherwise."""
         return self.metrics.get(name, otherwise)
 
     @property
-    def study(self) -> Mapping[str, Any]:
+    def study(self) -> ByName:
         """What the study is about."""
-        study: Mapping[str, Any] = self.metrics["study"]
-        return study
+        return self.metrics["study"]
 
     @property
-    def measured(self) -> tuple[str, ...]:
+    def measured(self) -> Names:
         """Channels that are measured at run time."""
         return tuple(self.study.get("measured", ()))
 
     @property
-    def observers(self) -> Mapping[str, Mapping[str, Any]]:
+    def observers(self) -> Mapping[str, ByName]:
         """What is known of every observer."""
-        observers: Mapping[str, Mapping[str, Any]] = self.get("observers", {})
-        return observers
+        return self.get("observers", {})
 
     @property
     def deployed(self) -> str:
@@ -50,7 +46,7 @@ class Facts:
         return observer_label(self.deployed)
 
     @property
-    def entry(self) -> Mapping[str, Any]:
+    def entry(self) -> ByName:
         """What is known of the deployed observer."""
         return self.observers.get(self.deployed, {})
 

@@ -1,7 +1,5 @@
 """Figures to bytes and files: SVG for the page, PNG and PDF for papers and slides."""
 
-from __future__ import annotations
-
 import io
 import logging
 import re
@@ -12,16 +10,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from ..core.errors import ConfigError
-from ..core.files import write_bytes
-from ..core.work import Progress
-from .canvas import Figure, settle
+from ..core import ConfigError, Progress, write_bytes
+from .canvas import Figure
 from .figures import FIGURES, draw_all
 from .run_folder import RunFolder
 from .theme import DRAWING, Tone, style
 
 log = logging.getLogger(__name__)
 
+_CHANGING = {"png": ["Software"], "pdf": ["CreationDate", "Creator", "Producer"]}  # what no file states
 _FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 _FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?DejaVu Sans'?(?:, [^;\"]*)?")
 _COORDINATES = re.compile(r'(?<= )(?:d|x|y|transform)="[^"]*"')
@@ -30,32 +27,25 @@ _BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")  # a hundredth of a point is enough
 
 def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
     """Write every figure of a run as PNG and PDF to a folder; return the names of the files in their order."""
-    out = Path(out)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
     names, progress, began = [], progress or Progress(), time.perf_counter()
     progress.start("figures", len(FIGURES))
-    for drawn in draw_all(RunFolder(Path(run))):
+    for drawn in draw_all(RunFolder(run)):
         progress.advance()
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)
             continue
-        for suffix, encode in (("png", to_png), ("pdf", to_pdf)):
-            write_bytes(out / f"{drawn.name}.{suffix}", encode(drawn.figure))
+        for suffix in _CHANGING:
+            write_bytes(out / f"{drawn.name}.{suffix}", printed(drawn.figure, suffix))
             names.append(f"{drawn.name}.{suffix}")
     progress.finish("figures", time.perf_counter() - began, skipped=False)
     return names
 
 
-def to_png(figure: Figure) -> bytes:
-    """Return a figure as PNG, 200 dots an inch."""
-    return _encode(figure, "png", dpi=DRAWING.dots_per_inch, metadata={"Software": None})
-
-
-def to_pdf(figure: Figure) -> bytes:
-    """Return a figure as PDF; the same content gives the same bytes."""
-    metadata = dict.fromkeys(("CreationDate", "Creator", "Producer"))
-    return _encode(figure, "pdf", dpi=DRAWING.dots_per_inch, metadata=metadata)
+def printed(figure: Figure, kind: str) -> bytes:
+    """Return a figure as PNG or PDF, 200 dots an inch; the same content gives the same bytes."""
+    return _encode(figure, kind, dpi=DRAWING.dots_per_inch, metadata=dict.fromkeys(_CHANGING[kind]))
 
 
 def to_svg(figure: Figure, name: str) -> str:
@@ -70,7 +60,7 @@ def to_svg(figure: Figure, name: str) -> str:
     text = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', opening, text, count=1)
     text = _named_units(text)
     for tone in Tone:
-        text = text.replace(tone.light, f"var({tone.variable})")
+        text = text.replace(tone, f"var({tone.variable})")
     text = _FAMILY.sub(_FONTS, text)
     return _COORDINATES.sub(lambda match: _BEYOND.sub("", match.group()), text).strip()
 
@@ -93,6 +83,8 @@ def _named_units(text: str) -> str:
 def _encode(figure: Figure, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     with style():
-        settle(figure)
+        if (engine := figure.get_layout_engine()) is not None:  # once: every file would lay it out again
+            engine.execute(figure)
+            figure.set_layout_engine(None)
         figure.savefig(buffer, format=kind, **options)
     return buffer.getvalue()

@@ -1,15 +1,13 @@
 """The report: one HTML file with everything in it."""
 
-from __future__ import annotations
-
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from ..core.files import write_bytes
+from ..core import ByName, Record, write_bytes
 from .content import Section
 from .facts import Facts
 from .figures import draw
@@ -28,17 +26,17 @@ Encoded = dict[str, str]
 Mapped = Callable[[Callable[[str], Encoded], Iterable[str]], Iterator[Encoded]]
 
 
-def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Path | None = None) -> Path:
+def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = None) -> Path:
     """Write the report of a run from ``metrics.json``, of which any part but ``study`` may be absent.
 
     `mapped` maps the drawing of a figure over their names, in order, for example in several processes.
     """
-    path = out if out is not None else Path(run) / "report.html"
-    write_bytes(path, page(RunFolder(Path(run)), metrics, mapped).encode())
+    path = out if out is not None else run / "report.html"
+    write_bytes(path, page(RunFolder(run), metrics, mapped).encode())
     return path
 
 
-def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> str:
+def page(run: RunFolder, metrics: ByName, mapped: Mapped = map) -> str:
     """Return the report as HTML."""
     from markupsafe import Markup
 
@@ -66,16 +64,10 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    absent: Record = {"head": None, "evidence": (), "figures": {}}
+    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": Markup(stylesheet())}
     script = Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8"))
-    look: dict[str, Any] = {
-        "style": Markup(stylesheet()),
-        "script": script,
-        "head": None,
-        "evidence": (),
-        "figures": {},
-    }
-    template = environment.get_template("report.html.jinja")
-    return template.render(look | parts, name=name, subtitle=subtitle, sections=sections)
+    return environment.get_template("report.html.jinja").render(absent | parts, script=script)
 
 
 def encoded(run: RunFolder, name: str) -> Encoded:
@@ -83,12 +75,12 @@ def encoded(run: RunFolder, name: str) -> Encoded:
     drawn = draw(name, run)
     svg = "" if drawn.figure is None else to_svg(drawn.figure, name)
     svg = svg.replace('role="img"', f'role="img" aria-label="{escape(drawn.title)}"', 1)
-    return {"name": name, "title": drawn.title, "svg": svg, "caption": drawn.caption, "reason": drawn.reason}
+    return vars(drawn) | {"svg": svg, "figure": None}
 
 
 def stylesheet() -> str:
     """Return the page's style with the tones of the figures as variables, for light and dark pages."""
-    light = "".join(f"{t.variable}:{t.light};" for t in Tone)
+    light = "".join(f"{t.variable}:{t};" for t in Tone)
     dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)
     text = (_TEMPLATES / "report.css").read_text(encoding="utf-8")
     return text.replace("/* light tones */", light).replace("/* dark tones */", dark)

@@ -14,10 +14,8 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from pydantic import Field, NonNegativeFloat
 
+from ..core import ConfigError, DataError, Names, Settings, is_file, stamp_of
 from ..core.artifacts import CHECKSUM, check_checksum, file_digest, read_json, with_checksum, write_json
-from ..core.errors import ConfigError, DataError
-from ..core.files import is_file, stamp_of
-from ..core.settings import Settings
 
 MANIFEST, INDEX = "manifest.json", "artefact.json"
 Described = tuple[str, int, int]  # SHA-256, size in bytes, time of the last change in ns
@@ -29,7 +27,7 @@ class Artefact(Settings):
     digest: str = Field(pattern="^[0-9a-f]{64}$")
     seconds: NonNegativeFloat = 0.0  # that it took
     files: dict[str, Described] = Field(default_factory=dict)  # by name
-    results: tuple[str, ...] = ()  # digests of the results that it was computed from
+    results: Names = ()  # digests of the results that it was computed from
 
     @classmethod
     def read(cls, path: Path) -> Artefact:
@@ -55,8 +53,9 @@ def place(folder: Path, name: str) -> Path:
     for depth in range(1, len(parts)):
         path = folder.joinpath(*parts[:depth])
         if path.is_symlink():
-            problem = f"{path} is a link, and results stay inside the folder"
-            raise DataError(f"Run folder {folder}: {problem}; put a folder in its place.")
+            raise DataError(
+                f"Run folder {folder}: {path} is a link, and results stay inside the folder; put a folder in its place."
+            )
     return folder / name
 
 
@@ -68,8 +67,9 @@ def read_manifest(folder: Path) -> dict[str, Artefact]:
     try:
         return {stage: Artefact.of(content, stage) for stage, content in _checked(path).items()}
     except (ConfigError, DataError, AttributeError, TypeError) as error:
-        problem = f"is damaged, or of another version of kros ({error})"
-        raise DataError(f"Manifest {path}: {problem}; run the study again.") from error
+        raise DataError(
+            f"Manifest {path}: is damaged, or of another version of kros ({error}); run the study again."
+        ) from error
 
 
 def _checked(path: Path) -> Mapping[str, object]:

@@ -1,13 +1,11 @@
 """What models, observers and channels are called and coloured: the same in every figure, table and sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from math import floor, isfinite, log10
 from typing import TypeVar
 
-from ..data.population import DEFAULT_CONDITION, EpisodeKey
+from ..core import frozen
+from ..data import DEFAULT_CONDITION, EpisodeKey
 from ..design.baselines import BASELINES
 from ..design.methods import METHODS
 from ..design.task import Label, split_name
@@ -18,7 +16,7 @@ LABELS = {method.name: method.label for method in METHODS} | BASELINES
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-@dataclass(frozen=True)
+@frozen
 class Look:
     """Colour and line style of a curve; `weight` multiplies its width."""
 
@@ -58,13 +56,13 @@ def observer_label(name: str) -> str:
 
 def model_look(name: str) -> Look:
     """Return how a model's curves look: Koopman blue, linear orange."""
-    return Look((Tone.BLUE if is_koopman(name) else Tone.ORANGE).light)
+    return Look(Tone.BLUE if is_koopman(name) else Tone.ORANGE)
 
 
 def method_look(name: str) -> Look:
     """Return how an observer's curves look beside others of the same model: the hue of its method."""
     label = label_of(name)
-    return Look(Tone[label.tone].light, label.line)
+    return Look(Tone[label.tone], label.line)
 
 
 def observer_look(name: str) -> Look:

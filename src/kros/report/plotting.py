@@ -1,12 +1,10 @@
 """Figures of results in memory, behind their method `plot`."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from inspect import signature
 from typing import Any
 
-from ..core.errors import ConfigError
+from ..core import ConfigError
 from .canvas import Figure
 from .theme import style
 

@@ -3,30 +3,21 @@
 Only files in the records of the run count. What a run does not have raises `NotShownError`, whose message says why.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import numpy as np
 
-from ..core.arrays import AnyArray, frozen
-from ..core.artifacts import load_artifact, read_json
-from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
+from ..core import AnyArray, Names, Record, frozen, load_artifact, read_json
+from ..data.population import OUTLIERS, Channel, Channels, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
 from .manifest import MANIFEST, recorded_files
-from .names import linear_first
-
-Record = dict[str, Any]  # content of an artifact
-
-T = TypeVar("T")
+from .names import T, linear_first
 
 
 class NotShownError(Exception):
@@ -45,7 +36,7 @@ class Shown:
     models: Mapping[str, AnyArray]  # mapping of str to ndarray, shape (n_samples, n)
 
 
-@dataclass(frozen=True)
+@frozen
 class RunFolder:
     """A run that has ended, or a part of one."""
 
@@ -65,8 +56,7 @@ class RunFolder:
     @cached_property
     def study(self) -> Record:
         """The study with all settings."""
-        content: Record = read_json(self.folder / "study.json")
-        return content
+        return read_json(self.folder / "study.json")
 
     @cached_property
     def facts(self) -> Record:
@@ -85,7 +75,7 @@ class RunFolder:
         return [unit for unit, group in self.facts["groups"].items() if group == OUTLIERS]
 
     @cached_property
-    def channels(self) -> tuple[Channel, ...]:
+    def channels(self) -> Channels:
         """Channels with their units of measure."""
         return next(iter(self.models.values())).channels
 
@@ -116,7 +106,7 @@ class RunFolder:
         return self._at_home("models/*/model.json", ModelSet.load, "no models have been identified yet")
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def kinds(self) -> Names:
         """Kinds of models that observers are designed for, the leading one first."""
         return tuple(self._record("models/models.json")["kinds"])
 

@@ -4,15 +4,14 @@ A figure is drawn in the light tones; in the report's inline SVG every tone is a
 Hues follow Okabe and Ito and stay apart for colour-blind readers; meaning is never carried by hue alone.
 """
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from enum import Enum
-from typing import Any
+from enum import StrEnum
+from typing import Self
+
+from ..core import Record, frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Drawing:
     """How much is drawn; no number here changes a result."""
 
@@ -43,30 +42,28 @@ class Drawing:
 DRAWING = Drawing()
 
 
-class Tone(Enum):
-    """A colour by what it is for: tone on light paper, tone on dark paper."""
+class Tone(StrEnum):
+    """A colour by what it is for: the tone on light paper, which figures are drawn in, and that on dark paper."""
 
-    INK = ("#22262b", "#e6e9ec")
-    SOFT = ("#5d656e", "#a5adb5")
-    GRID = ("#dde1e5", "#363d44")
-    BLUE = ("#0a69b4", "#58aef2")
-    ORANGE = ("#d4520e", "#ff8c52")
-    GREEN = ("#10826a", "#3ecaa6")
-    PURPLE = ("#a44e90", "#e391cd")
-    GOLD = ("#b98003", "#edb83c")
-    SKY = ("#4d9fd6", "#8fccf3")
-    GREY = ("#878f97", "#878f98")
-    ALARM = ("#b3001f", "#ff6272")
+    INK = "#22262b", "#e6e9ec"
+    SOFT = "#5d656e", "#a5adb5"
+    GRID = "#dde1e5", "#363d44"
+    BLUE = "#0a69b4", "#58aef2"
+    ORANGE = "#d4520e", "#ff8c52"
+    GREEN = "#10826a", "#3ecaa6"
+    PURPLE = "#a44e90", "#e391cd"
+    GOLD = "#b98003", "#edb83c"
+    SKY = "#4d9fd6", "#8fccf3"
+    GREY = "#878f97", "#878f98"
+    ALARM = "#b3001f", "#ff6272"
 
-    @property
-    def light(self) -> str:
-        """Tone on light paper, the one that figures are drawn in."""
-        return str(self.value[0])
+    dark: str
 
-    @property
-    def dark(self) -> str:
-        """Tone on dark paper."""
-        return str(self.value[1])
+    def __new__(cls, light: str, dark: str) -> Self:
+        """Return a member that is its light tone."""
+        tone = str.__new__(cls, light)
+        tone._value_, tone.dark = light, dark
+        return tone
 
     @property
     def variable(self) -> str:
@@ -76,28 +73,28 @@ class Tone(Enum):
 
 HUES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)
 
-_SETTINGS: dict[str, Any] = {
+_SETTINGS: Record = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": "medium",
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    "axes.titlecolor": Tone.INK.light,
+    "axes.titlecolor": Tone.INK,
     "axes.labelsize": "medium",
-    "axes.labelcolor": Tone.INK.light,
-    "axes.edgecolor": Tone.SOFT.light,
+    "axes.labelcolor": Tone.INK,
+    "axes.edgecolor": Tone.SOFT,
     "axes.linewidth": DRAWING.thin,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.facecolor": "none",
-    "grid.color": Tone.GRID.light,
+    "grid.color": Tone.GRID,
     "grid.linewidth": DRAWING.thin,
-    "text.color": Tone.INK.light,
-    "xtick.color": Tone.SOFT.light,
-    "ytick.color": Tone.SOFT.light,
-    "xtick.labelcolor": Tone.INK.light,
-    "ytick.labelcolor": Tone.INK.light,
+    "text.color": Tone.INK,
+    "xtick.color": Tone.SOFT,
+    "ytick.color": Tone.SOFT,
+    "xtick.labelcolor": Tone.INK,
+    "ytick.labelcolor": Tone.INK,
     "xtick.labelsize": "small",
     "ytick.labelsize": "small",
     "xtick.major.width": DRAWING.thin,
@@ -117,5 +114,4 @@ def style() -> AbstractContextManager[None]:
     """Return a context in which new figures get this theme; settings of the caller come back afterwards."""
     import matplotlib
 
-    context: AbstractContextManager[None] = matplotlib.rc_context(_SETTINGS)  # type: ignore[arg-type]
-    return context
+    return matplotlib.rc_context(_SETTINGS)  # type: ignore[arg-type]

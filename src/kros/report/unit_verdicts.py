@@ -1,27 +1,20 @@
 """Verdicts of `kros check` in words, and as CSV, HTML and JUnit XML."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
+from ..core import ConfigError, Record, frozen, write_bytes
 from ..core.artifacts import json_bytes
-from ..core.errors import ConfigError
-from ..core.files import write_bytes
-from ..data.shown import Shown
+from ..data import Shown
 from ..uncertainty.outliers.score import FEWEST_UNITS, Status
 from .content import Column, Section, build
 from .html import filled
 
-Row = dict[str, Any]  # scores and verdict of a unit in a condition
-
-Rows = list[Row]
+Rows = list[Record]
 _COLUMNS = [
     "verdict",
     "unit",
@@ -36,7 +29,7 @@ _COLUMNS = [
 ]
 
 
-@dataclass(frozen=True, repr=False)
+@frozen
 class Check(Shown):
     """What `kros check` says of units: one row of scores with a verdict for every unit and condition."""
 
@@ -45,7 +38,7 @@ class Check(Shown):
     def __repr__(self) -> str:
         return f"<Check: {', '.join(f'{unit} {verdict}' for unit, (verdict, _) in by_unit(self.rows).items())}>"
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         return {unit: f"{verdict}, {'; '.join(reasons)}" for unit, (verdict, reasons) in by_unit(self.rows).items()}
 
 
@@ -57,26 +50,26 @@ class Verdict(StrEnum):
     FAIL = "FAIL"
 
 
-def with_verdict(row: Row) -> Row:
+def with_verdict(row: Record) -> Record:
     """Return a row of scores with its verdict and the reason in words."""
     verdict = Verdict.PASS if row["status"] == Status.OK else Verdict.UNDECIDED
     return row | {"verdict": Verdict.FAIL if row["outlier"] else verdict, "reason": "; ".join(_reasons(row))}
 
 
-def by_unit(rows: Sequence[Row]) -> dict[str, tuple[Verdict, list[str]]]:
+def by_unit(rows: Sequence[Record]) -> dict[str, tuple[Verdict, list[str]]]:
     """Return the verdict on every unit, and the reason of every condition."""
-    units: dict[str, list[Row]] = {}
+    units = dict[str, list[Record]]()
     for row in rows:
         units.setdefault(row["unit"], []).append(row)
     return {u: (worst(of), [f"{row['condition']}: {row['reason']}" for row in of]) for u, of in units.items()}
 
 
-def worst(rows: Sequence[Row]) -> Verdict:
+def worst(rows: Sequence[Record]) -> Verdict:
     """Return the verdict of rows together: FAIL before UNDECIDED before PASS."""
     return max((Verdict(row["verdict"]) for row in rows), key=list(Verdict).index)
 
 
-def verdict_lines(rows: Sequence[Row]) -> list[str]:
+def verdict_lines(rows: Sequence[Record]) -> list[str]:
     """Return the word and the name of every unit, each followed by an indented line for every condition."""
     units = by_unit(rows).items()
     return [line for u, (v, reasons) in units for line in (f"{v:<9}  {u}", *(f"  {text}" for text in reasons))]
@@ -100,7 +93,7 @@ def html_text(rows: Rows) -> str:
     return filled("kros check", worst(rows), [section])
 
 
-def junit_text(rows: Sequence[Row]) -> str:
+def junit_text(rows: Sequence[Record]) -> str:
     """Return JUnit XML with a test case for every unit; UNDECIDED is an error, so that a build does not pass on it."""
     units, tags = by_unit(rows), {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}
     counts = {f"{tag}s": str(sum(v is verdict for v, _ in units.values())) for verdict, tag in tags.items()}
@@ -119,7 +112,7 @@ def _printable(text: str) -> str:
     return "".join(c if c.isprintable() else "_" for c in text)
 
 
-def _reasons(row: Row) -> list[str]:
+def _reasons(row: Record) -> list[str]:
     """Return what a verdict rests on."""
     reasons = []
     if row["score"] is not None and row["threshold"] is not None:

@@ -3,23 +3,20 @@
 The head of the report and the lines behind ``kros run`` both come from here.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from enum import Enum
-from typing import Any
 
-from ..data.recording import some
+from ..core import ByName, frozen
+from ..data import some
 from ..design.task import split_name
 from .error_tables import ErrorCell, ErrorTable, tables_of
 from .facts import Facts
 from .names import condition_label, joined, label_of, number, observer_label, words
 
-Row = Mapping[str, Any]
+Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the section with the details
 
 
-@dataclass(frozen=True)
+@frozen
 class Thresholds:
     """From where on a difference is a reason to check."""
 
@@ -40,7 +37,7 @@ class Status(Enum):
     NOT_READY = "NOT READY"
 
 
-@dataclass(frozen=True)
+@frozen
 class Reason:
     """Why a run is not READY, what to do about it, and the section of the report with the details."""
 
@@ -50,7 +47,7 @@ class Reason:
     section: str
 
 
-@dataclass(frozen=True)
+@frozen
 class Number:
     """A number that stands alone, with its unit of measure, what it is, and what puts it into proportion."""
 
@@ -60,7 +57,7 @@ class Number:
     notes: Sequence[str] = ()
 
 
-@dataclass(frozen=True)
+@frozen
 class Verdict:
     """The head of the report."""
 
@@ -77,8 +74,7 @@ def judge(facts: Facts) -> Verdict:
     reasons = [Reason(Status.NOT_READY, *stop) for stop in _stopping(facts)]
     for checks in (_of_recordings, _of_units, _of_errors, _of_certificates):
         reasons += [Reason(Status.CHECK, *check) for check in checks(facts)]
-    known = [reason.status for reason in reasons]
-    status = next((s for s in (Status.NOT_READY, Status.CHECK) if s in known), Status.READY)
+    status = reasons[0].status if reasons else Status.READY
     certified = certificates(facts)
     void = voids(facts) if certified else []
     return Verdict(status, _sentence(facts, status, reasons), reasons, _numbers(facts), certified, void)
@@ -125,7 +121,7 @@ def _lag(lag_s: float | None) -> str:
     return f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
 
 
-def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _stopping(facts: Facts) -> Checks:
     """Yield what stops, what to do, and where the details are."""
     table, hidden = facts.table, facts.hidden
     if not facts.deployed:
@@ -145,7 +141,7 @@ def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield text, "Do not use it on new units.", "left-out"
 
 
-def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _of_recordings(facts: Facts) -> Checks:
     """Yield alerts of the recordings, confounded conditions, and too short recordings."""
     for alert in facts.study.get("alerts", ()):
         yield f"Recordings: {alert.rstrip('.')}.", "Look at the recordings.", "recordings"
@@ -163,7 +159,7 @@ def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield f"{text}not variation between units.", "Record longer, or more episodes.", "spread"
 
 
-def _of_units(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _of_units(facts: Facts) -> Checks:
     """Yield units that are flagged, undecided or have a remark."""
     rows = facts.get("outliers", [])
     if flagged := [r for r in rows if r["outlier"]]:
@@ -180,19 +176,21 @@ def _of_units(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
 
 
-def _inconclusive(rows: Sequence[Row], every: Sequence[Row]) -> str:
+def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
     """Say how many scores decide nothing."""
     if len(rows) == len(every):
         return f"No outlier score is conclusive ({len(rows)} of {len(every)})."
     return f"{len(rows)} of {len(every)} outlier scores are not conclusive: {units_text(rows)}."
 
 
-def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _of_errors(facts: Facts) -> Checks:
     """Yield better observers, channels without improvement, and bounds that errors exceed."""
     table, hidden = facts.table, facts.hidden
     if table is None:
         return
-    if (better := better_observer(table, facts.deployed, hidden)) is not None:
+    ratio, others = 1 - THRESHOLDS.better, [name for name in table.cells if name != facts.deployed]
+    if rivals := [name for name in others if _smaller(table, name, facts.deployed, hidden, ratio)]:
+        better = min(rivals, key=lambda name: table.mean(name, hidden))  # the most accurate one
         text = f"“{observer_label(better)}” has smaller errors in all hidden channels."
         designed = "relift_certified" in facts.observers.get(better, {})
         export = f"`kros export c --observer {better}` exports it."
@@ -215,7 +213,7 @@ def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
             yield text, "Do not rely on this number; record more kinds of episodes.", "certificates"
 
 
-def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
+def _of_certificates(facts: Facts) -> Checks:
     """Yield what is not certified or bounded, and folds that failed."""
     if facts.entry.get("relift_certified") is False:
         action = "Test it in parallel before anything depends on it."
@@ -233,14 +231,14 @@ def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
 
 
-def undecided(rows: Sequence[Row]) -> list[Row]:
+def undecided(rows: Sequence[ByName]) -> list[ByName]:
     """Return the outlier scores that decide nothing."""
     return [r for r in rows if r.get("status") in ("not enough data", "cannot tell")]
 
 
-def units_text(rows: Sequence[Row]) -> str:
+def units_text(rows: Sequence[ByName]) -> str:
     """Return units with their conditions, for a sentence."""
-    units: dict[str, list[str]] = {}
+    units = dict[str, list[str]]()
     for row in rows:
         units.setdefault(row["unit"], []).append(condition_label(row["condition"]))
     named = {unit: ", ".join(filter(None, conditions)) for unit, conditions in units.items()}
@@ -277,12 +275,6 @@ def voids(facts: Facts) -> list[str]:
         texts += ["The unit is worn, badly assembled, or of another batch."]
     rate = 1 / facts.study["sample_period_s"]
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]
-
-
-def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> str | None:
-    """Return the most accurate of the observers that are clearly better in every channel; None where none is."""
-    better = [o for o in table.cells if o != name and _smaller(table, o, name, channels, 1 - THRESHOLDS.better)]
-    return min(better, key=lambda o: table.mean(o, channels), default=None)
 
 
 def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:

@@ -9,7 +9,7 @@ Examples
 ('auto', 0.95)
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 from .config import Stage, StudyConfig, load_config, validate_config
 from .pipeline import RunResult, run
 

@@ -10,17 +10,12 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from ..core.errors import ConfigError
-from ..core.files import read_toml, shortened
-from ..core.settings import Settings
+from ..core import ConfigError, Names, Record, Settings, read_toml, shortened
 from ..data.readers.csv_folder import mapping_schema
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
-from ..observer import EstimatorSettings
-from ..observer.sensor import Sensor
+from ..observer import EstimatorSettings, Sensor
 from ..uncertainty.settings import UncertaintySettings
-
-Tables = dict[str, Any]  # of TOML
 
 
 class Stage(StrEnum):
@@ -48,15 +43,15 @@ class DataConfig(Settings):
 
     source: Path = Field(description="folder of the recordings, relative to the study file")
     reader: str = Field("motor-drive-raw", description="motor-drive-raw, csv (tables in files of any kind) or parquet")
-    exclude: tuple[str, ...] = Field((), description="units that take no part in anything")
+    exclude: Names = Field((), description="units that take no part in anything")
     identify_on: str | None = Field(
         None, description="condition that models and observers are made from; by default noload, or else the first"
     )
     on_nan: Literal["error", "drop_episode"] = Field(
         "error", description="what an episode with a missing value is: an error, or left out"
     )
-    prepare: tuple[Tables, ...] = Field((), description="preparation steps, in order")
-    csv: Tables | None = Field(None, description="the mapping, for the reader csv")
+    prepare: tuple[Record, ...] = Field((), description="preparation steps, in order")
+    csv: Record | None = Field(None, description="the mapping, for the reader csv")
 
     @field_validator("source")
     @classmethod
@@ -69,7 +64,7 @@ class DataConfig(Settings):
 class SplitConfig(Settings):
     """Which episodes are held out."""
 
-    test: tuple[str, ...] | None = Field(
+    test: Names | None = Field(
         None, description="episodes held out; by default the last tenth of every unit and condition, at least one"
     )
 
@@ -100,7 +95,7 @@ class LoadConfig(Settings):
         None, description="of the mounted mass, in units of current; without it nothing is done about load"
     )
     inertia: float = Field(0.0, ge=0, description="of the mounted mass, in the same units")
-    units: tuple[str, ...] = Field(
+    units: Names = Field(
         (), description="on which the load is known; by default the first two recorded in the condition load"
     )
 
@@ -131,7 +126,7 @@ class StudyConfig(Settings):
     evaluate: EvaluateConfig = EvaluateConfig()
     load: LoadConfig = LoadConfig()
 
-    def dump(self) -> Tables:
+    def dump(self) -> Record:
         """Return the resolved study in JSON's types."""
         return self.model_dump(mode="json")
 
@@ -161,7 +156,7 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     return validate_config(raw, path.parent, str(path), overrides)
 
 
-def validate_config(raw: Tables, base: Path, origin: str = "study", overrides: Sequence[str] = ()) -> StudyConfig:
+def validate_config(raw: Record, base: Path, origin: str = "study", overrides: Sequence[str] = ()) -> StudyConfig:
     """Validate a study given as tables; a relative source is relative to `base`, overrides are as in `load_config`.
 
     Examples
@@ -180,7 +175,7 @@ def validate_config(raw: Tables, base: Path, origin: str = "study", overrides: S
     return config.model_copy(update={"data": config.data.model_copy(update={"source": source})})
 
 
-def study_schema() -> Tables:
+def study_schema() -> Record:
     """Return the JSON schema of a study file, with the mapping of recordings and the preparation steps."""
     schema, mapping = StudyConfig.model_json_schema(), mapping_schema()
     schema["$defs"] |= {**mapping.pop("$defs"), "CsvMapping": mapping}
@@ -197,7 +192,7 @@ def stored_config(raw: Any, path: Path) -> StudyConfig:
         raise ConfigError(f"{error} It is damaged, or of another version of kros; run the study again.") from error
 
 
-def _apply(raw: Tables, override: str) -> None:
+def _apply(raw: Record, override: str) -> None:
     key, separator, text = override.partition("=")
     if not separator or not key.strip():
         raise ConfigError(f"--set {override!r}: should look like KEY=VALUE, for example identify.alpha=90.")

@@ -3,11 +3,7 @@
 What was not run is absent, what is unknown is null, nothing is invented.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from ..core.artifacts import load_artifact, plain
+from ..core import Record, load_artifact, plain
 from ..evaluate.over_units import interval_rows
 from ..observer import Observer
 from ..observer.sensor_gains import sensor_gains
@@ -19,30 +15,27 @@ from .engine.store import Store
 from .stages import left_out
 from .stages.load import load_metrics
 
-Part = dict[str, Any]  # of metrics.json
 
-
-def collect_metrics(context: Context, until: Stage) -> Part:
+def collect_metrics(context: Context, until: Stage) -> Record:
     """Collect the metrics of all stages up to one."""
     done = list(Stage)[: list(Stage).index(until) + 1]
     manifest = context.store.manifest
     timing = {str(stage): manifest[stage].seconds for stage in done if stage in manifest}
     timing["total"] = sum(timing.values())
-    metrics: Part = {"schema": 1, "study": _study(context, done), "timing_s": timing}
+    metrics: Record = {"schema": 1, "study": _study(context, done), "timing_s": timing}
     metrics["units"] = _units(context, done)
     for stage in done:
         if stage is Stage.EVALUATE:
             metrics |= _evaluation(context, metrics)
         elif stage in _OF_STAGES:
             metrics |= _OF_STAGES[stage](context)
-    clean: Part = plain(metrics)
-    return clean
+    return plain(metrics)
 
 
-def _study(context: Context, done: list[Stage]) -> Part:
+def _study(context: Context, done: list[Stage]) -> Record:
     facts, population, sensor = context.facts, context.population, context.config.sensor
     parts = {"train": facts.train, "held_out": facts.test}
-    study: Part = {
+    study: Record = {
         "units": len(facts.pooled),
         "conditions": population.conditions,
         "identify_on": facts.identify_on,
@@ -67,13 +60,13 @@ def _study(context: Context, done: list[Stage]) -> Part:
     return study | ({"deployed": context.observers_record["deployed"]} if Stage.SYNTHESIZE in done else {})
 
 
-def _units(context: Context, done: list[Stage]) -> list[Part]:
-    facts, rows = context.facts, list[Part]()
+def _units(context: Context, done: list[Stage]) -> list[Record]:
+    facts, rows = context.facts, list[Record]()
     calibration = context.calibration if Stage.CALIBRATE in done else None
     models = context.identified.models() if Stage.IDENTIFY in done else None
     for unit, group in facts.groups.items():
         keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
-        row: Part = {"unit": unit, "group": group}
+        row: Record = {"unit": unit, "group": group}
         row |= {"conditions": list(dict.fromkeys(k.condition for k in keys)), "status": "ok"}
         if calibration is not None:
             phase = calibration.units.get(unit)
@@ -87,17 +80,17 @@ def _units(context: Context, done: list[Stage]) -> list[Part]:
     return rows
 
 
-def _calibration(context: Context) -> Part:
+def _calibration(context: Context) -> Record:
     """What the phase of every unit belongs to; empty for a study without one."""
     calibration = context.calibration
     if calibration is None:
         return {}
     spec = calibration.spec
-    names = ("ratio", "angle", "parameter")
-    return {"calibration": {name: getattr(spec, name) for name in names} | {"lag_rad": calibration.lag_rad}}
+    entry = {name: getattr(spec, name) for name in ("ratio", "angle", "parameter")}
+    return {"calibration": entry | {"lag_rad": calibration.lag_rad}}
 
 
-def _models(context: Context) -> Part:
+def _models(context: Context) -> Record:
     """Models: order, functions and largest spectral radius over the pooled units."""
     entries = {}
     for name in context.identified.kinds:
@@ -109,17 +102,17 @@ def _models(context: Context) -> Part:
     return {"models": entries}
 
 
-def _uncertainty(context: Context) -> Part:
+def _uncertainty(context: Context) -> Record:
     """Uncertain models by kind, and the scores of all units."""
     uncertain = context.uncertain
     entries = {name: _uncertain_model(context.store, name, one) for name, one in uncertain.sets.items()}
     return {"uncertainty": entries, "outliers": uncertain.scores}
 
 
-def _uncertain_model(store: Store, name: str, model: UncertainModel) -> Part:
+def _uncertain_model(store: Store, name: str, model: UncertainModel) -> Record:
     """Return the metrics of one uncertain model, and the share of noise in it."""
     weight = model.weight
-    entry: Part = {name: getattr(model, name) for name in ("form", "peak_db", "misfit_max")}
+    entry: Record = {name: getattr(model, name) for name in ("form", "peak_db", "misfit_max")}
     entry["nominal"] = model.nominal_id
     entry["weight"] = {name: getattr(model, name) for name in ("cover_max", "overbound_db_max")}
     entry["weight"]["orders"] = [weight.left_orders, weight.right_orders]
@@ -129,7 +122,7 @@ def _uncertain_model(store: Store, name: str, model: UncertainModel) -> Part:
     return entry
 
 
-def _observers(context: Context) -> Part:
+def _observers(context: Context) -> Record:
     """Observers with what their synthesis and certificates state, and what the deployed one reads."""
     record = context.observers_record
     entries = {name: dict(facts) for name, facts in record["facts"].items()}
@@ -142,7 +135,7 @@ def _observers(context: Context) -> Part:
     return {"observers": entries, "deployment": _deployment(context)}
 
 
-def _deployment(context: Context) -> Part:
+def _deployment(context: Context) -> Record:
     """Return what the deployed observer reads, estimates and needs of its sensors."""
     observer = Observer.load(context.store.path("observers", "deployed.json"))
     measured, sizes = observer.outputs, observer.about["largest_in_training"]
@@ -160,7 +153,7 @@ def _deployment(context: Context) -> Part:
     }
 
 
-def _evaluation(context: Context, metrics: Part) -> Part:
+def _evaluation(context: Context, metrics: Record) -> Record:
     """Errors on held-out episodes, of the load, and of recorded states where truth is recorded."""
     evaluated = context.evaluation
     for name, errors in evaluated["free_run"].items():

@@ -7,13 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import write_json
-from ..core.errors import ConfigError
-from ..core.settings import member
-from ..core.work import Executor, Progress, Work
-from ..data import Population
-from ..data.readers.opening import detect_reader
-from ..data.shown import Shown
+from ..core import ByName, ConfigError, Executor, Progress, Record, Work, member, write_json
+from ..data import Population, Shown, detect_reader
 from ..identify import IdentifiedModels
 from ..observer import Observer
 from ..report.facts import Facts
@@ -53,13 +48,13 @@ class RunResult(Shown):
     """
 
     folder: Path
-    metrics: dict[str, Any]
+    metrics: Record
 
     def __repr__(self) -> str:
         study = self.metrics["study"]
         return f"<RunResult {self.folder}: {study['units']} units, deployed is {study.get('deployed')}>"
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         facts, report = Facts(self.metrics), self.folder / "report.html"
         place = {"report": report} if report.exists() else {"results": self.folder}
         if not facts.deployed:
@@ -154,13 +149,13 @@ def run(
         return run_in(store, config, until, executor, progress, given, models)
 
 
-def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: Mapping[str, Any]) -> StudyConfig:
+def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: ByName) -> StudyConfig:
     """Return the study of some recordings, or a study, with keys of some tables changed."""
     base, tables = Path(), dict(sections)
     if isinstance(source, Population):
         if set(tables.get("data", ())) & {"source", "reader"}:
             raise ConfigError("Run: data.source and data.reader name recordings, and a population is given; drop them.")
-        raw: dict[str, Any] = {"name": out.name, "data": {"source": learning.ARRAYS, "reader": learning.ARRAYS}}
+        raw: Record = {"name": out.name, "data": {"source": learning.ARRAYS, "reader": learning.ARRAYS}}
         base = out
     elif isinstance(source, StudyConfig):
         raw = source.dump()

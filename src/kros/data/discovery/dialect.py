@@ -1,19 +1,17 @@
 """How a text file of numbers is written: encoding, delimiter, decimal point, header and rows of units."""
 
-from __future__ import annotations
-
 import codecs
 import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ...core.errors import DataError
+from ...core import DataError, Names, frozen
 from ..measures import is_unit_row
 from ..readers.formats import is_binary, values_of
 from ..readers.tables import ABSENT, ORDERS, Dialect, cells_of, file_fields, head_of, lines_of, microseconds
@@ -26,14 +24,14 @@ _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
 _NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
 
 
-@dataclass(frozen=True)
+@frozen
 class TableHead:
     """What the first lines of a file say."""
 
     dialect: Dialect
-    fields: tuple[str, ...]  # header; numbers of the columns as text where there is none
-    units: tuple[str, ...]  # cells of the row of units of measure, empty where there is none
-    rows: tuple[tuple[str, ...], ...]  # cells of the first rows of numbers
+    fields: Names  # header; numbers of the columns as text where there is none
+    units: Names  # cells of the row of units of measure, empty where there is none
+    rows: tuple[Names, ...]  # cells of the first rows of numbers
 
     def cells(self, column: int) -> list[str]:
         """Return the first cells of a column."""

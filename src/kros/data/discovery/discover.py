@@ -3,8 +3,6 @@
 folder ── dialect ── names of files ── columns ── parts ── mapping ── every episode looked at ── Discovery
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -15,10 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array
-from ...core.errors import ConfigError, DataError
-from ...core.files import did_you_mean
-from ...core.work import Work
+from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_mean, frozen
 from ..measures import split_header
 from ..population import EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder
@@ -30,8 +25,6 @@ from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
 from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
-Keys = dict[str, Any]  # of a mapping, by name
-
 _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
 
 
@@ -39,22 +32,22 @@ _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
 class Wanted:
     """What is said about a folder already."""
 
-    measured: tuple[str, ...] = ()
-    inputs: tuple[str, ...] = ()  # as `measured`: names of channels or of columns
+    measured: Names = ()
+    inputs: Names = ()  # as `measured`: names of channels or of columns
     files: str | None = None  # regular expression in place of the one that is found
     period_s: float | None = None  # where there is no column of time
 
 
-@dataclass(frozen=True)
+@frozen
 class Discovery:
     """What was found in a folder."""
 
-    mapping: Keys  # table ``[data.csv]``, with the keys that are not default
-    prepare: tuple[Keys, ...]  # steps of preparation that the recordings need
+    mapping: Record  # table ``[data.csv]``, with the keys that are not default
+    prepare: tuple[Record, ...]  # steps of preparation that the recordings need
     columns: tuple[TableColumn, ...]  # all of them, with their parts
     population: Population  # as the mapping reads it, before preparation
     notes: dict[str, str] = field(default_factory=dict)  # what a key of the mapping rests on
-    findings: tuple[str, ...] = ()  # what looks wrong
+    findings: Names = ()  # what looks wrong
     drop_nan: bool = False  # whether episodes with NaN or infinity have to be dropped
     reading: str = ""  # what the first file was taken for
 
@@ -65,10 +58,11 @@ def discover(source: Path, wanted: Wanted | None = None, work: Work | None = Non
     head, alike, strange = _alike(_files(source, wanted.files))
     names = infer_names(list(alike))
     if wanted.files is None and names.other is not None:
-        choice = f"--files '{names.other}' or --files '{names.pattern}'"
-        two = f"{some(list(alike), 3)} can be episodes of one unit or units with one recording each"
-        raise ConfigError(f"Names of files: {two}; choose, {choice}.")
-    mapping: Keys = {"files": wanted.files or names.pattern}
+        raise ConfigError(
+            f"Names of files: {some(list(alike), 3)} can be episodes of one unit or units with one recording each; "
+            f"choose, --files '{names.other}' or --files '{names.pattern}'."
+        )
+    mapping: Record = {"files": wanted.files or names.pattern}
     mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
     columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
     columns = _decided(columns, wanted)
@@ -123,7 +117,7 @@ def _fits(path: Path, head: TableHead) -> bool:
 
 def _columns(
     source: Path, head: TableHead, paths: Sequence[Path], period_s: float | None
-) -> tuple[list[TableColumn], Keys, dict[str, str]]:
+) -> tuple[list[TableColumn], Record, dict[str, str]]:
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
     described = _described(head)
     numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields[i]]
@@ -136,7 +130,7 @@ def _columns(
         _read(paths[0], head, numeric)  # says why not, where it cannot be read
         problem = "the files looked at have fewer than three rows of numbers"
         raise DataError(f"Looking at {source}: {problem}; check the folder.")
-    time, keys, notes = None, Keys(sample_period_s=period_s), dict[str, str]()
+    time, keys, notes = None, Record(sample_period_s=period_s), dict[str, str]()
     if not period_s:
         time, keys, notes = _time(source, head, described, numeric, samples)
         described[time] = replace(described[time], part=ColumnPart.TIME)
@@ -148,7 +142,7 @@ def _columns(
 
 def _described(head: TableHead) -> list[TableColumn]:
     """Return the columns by their headers, without parts."""
-    described: list[TableColumn] = []
+    described = list[TableColumn]()
     for i, (header, unit) in enumerate(zip(head.fields, head.units, strict=True)):
         column = describe(header or f"column {i + 1}", unit, [c.name for c in described])
         if not head.dialect.header or head.fields.count(header) > 1:
@@ -159,14 +153,14 @@ def _described(head: TableHead) -> list[TableColumn]:
 
 def _time(
     source: Path, head: TableHead, columns: Sequence[TableColumn], numeric: Sequence[int], samples: Sequence[Array]
-) -> tuple[int, Keys, dict[str, str]]:
+) -> tuple[int, Record, dict[str, str]]:
     """Return the column of time, the keys of a mapping that describe it, and what they rest on."""
     candidates = time_columns([columns[i] for i in numeric], samples)
     texts = [i for i in range(len(columns)) if head.timestamp(i) is not None]
     if candidates and (not texts or columns[numeric[candidates[0]]].kind == "time"):
         at = numeric[candidates[0]]
         scale, why = time_scale(columns[at], float(np.median(np.diff(samples[0][candidates[0]]))))
-        keys: Keys = {"time": columns[at].reference}
+        keys: Record = {"time": columns[at].reference}
         return (at, keys, {}) if scale == 1 else (at, keys | {"time_scale": scale}, {"time_scale": why})
     if texts:
         return texts[-1], {"time": columns[texts[-1]].reference, "timestamp": head.timestamp(texts[-1])}, {}
@@ -182,10 +176,10 @@ def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
     return np.where(usable(values), values, np.nan).T
 
 
-def _channel(column: TableColumn) -> Keys:
+def _channel(column: TableColumn) -> Record:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
     role, measured = "input" if column.part is ColumnPart.INPUT else "state", column.part is ColumnPart.MEASURED
-    table: Keys = {"name": column.name, "column": column.reference, "column_unit": column.recorded}
+    table: Record = {"name": column.name, "column": column.reference, "column_unit": column.recorded}
     table |= {"role": role, "measured": measured, "unit": column.unit, "scale": column.scale, "offset": column.offset}
     default = {name: f.default for name, f in ChannelMapping.model_fields.items()} | {"column": column.name}
     return {key: value for key, value in table.items() if value != default[key]}
@@ -255,7 +249,7 @@ def _examined(
 
 def _resampling(
     population: Population, source: Path, looks: Sequence[EpisodeLook], bridged: int
-) -> tuple[tuple[Keys, ...], list[str]]:
+) -> tuple[tuple[Record, ...], list[str]]:
     """Return the step that makes time even or bridges NaN, and a sentence about it; nothing where neither is needed."""
     median, worst = float(np.median([s.period_s for s in looks])), max(looks, key=lambda s: s.uneven)
     period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
@@ -280,7 +274,7 @@ def _reading(population: Population, source: Path) -> str:
     return f"{_relative(population, source, key)}: {parts}"
 
 
-def _exclusion(names: Sequence[str]) -> Keys:
+def _exclusion(names: Sequence[str]) -> Record:
     return {"exclude": f"^(?:{'|'.join(quoted(name) for name in dict.fromkeys(names))})$"} if names else {}
 
 

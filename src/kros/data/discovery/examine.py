@@ -1,19 +1,16 @@
 """What looks wrong in recordings, found in one pass before anything is computed: nothing stops at the first of it."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ...core.errors import DataError
-from ...core.work import Work
+from ...core import DataError, Work, frozen
 from ..population import EpisodeKey, Population
 from ..recording import GroupWatch, NonFiniteError, check_episode, check_increasing, copies_among, digest_of, usable
 
 
-@dataclass(frozen=True)
+@frozen
 class DiscoveryRule:
     """What recordings are judged by before a study exists."""
 
@@ -29,7 +26,7 @@ class DiscoveryRule:
 RULE = DiscoveryRule()
 
 
-@dataclass(frozen=True)
+@frozen
 class EpisodeLook:
     """What one episode looks like."""
 

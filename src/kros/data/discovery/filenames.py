@@ -5,13 +5,11 @@ by the word that it begins with or that stands before it (``run_3``), by what co
 place: units before episodes.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain, groupby
 
+from ...core import Names, frozen
 from ..population import OUTLIERS
 
 UNIT, CONDITION, EPISODE, GROUP = "unit", "condition", "episode", "group"
@@ -39,7 +37,7 @@ Roles = list[str | None]
 Cut = list[list[str]]  # words of every path, with what is between them
 
 
-@dataclass(frozen=True)
+@frozen
 class FileNames:
     """What the paths of a folder say."""
 
@@ -95,7 +93,7 @@ def _aligned(stems: Sequence[str]) -> Cut | None:
     return [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts] if tail > 0 else None
 
 
-def _roles(columns: list[tuple[str, ...]]) -> tuple[Roles, bool]:
+def _roles(columns: list[Names]) -> tuple[Roles, bool]:
     """Tell what every word is: text, or one of the groups; and whether words said so."""
     varying = [i for i, c in enumerate(columns) if len(set(c)) > 1]
     roles: Roles = [_by_words(columns, i) if i in varying else None for i in range(len(columns))]
@@ -121,7 +119,7 @@ def _roles(columns: list[tuple[str, ...]]) -> tuple[Roles, bool]:
     return _contiguous(roles), not left
 
 
-def _nested(outer: tuple[str, ...], inner: tuple[str, ...]) -> bool:
+def _nested(outer: Names, inner: Names) -> bool:
     """Tell whether words without numbers label units: every unit, a numbered word, has one, and a label has several."""
     values, labels = set(inner), set(outer)
     numbers = [bool(re.search(r"\d", v)) for v in (*values, *labels)]
@@ -129,7 +127,7 @@ def _nested(outer: tuple[str, ...], inner: tuple[str, ...]) -> bool:
     return apart and len(labels) < len(values) == len(set(zip(outer, inner, strict=True)))
 
 
-def _by_words(columns: list[tuple[str, ...]], i: int) -> str | None:
+def _by_words(columns: list[Names], i: int) -> str | None:
     """Return what words say about the words at one place."""
     values = {v.lower() for v in columns[i]}
     if values & {OUTLIERS, "outlier"}:
@@ -144,7 +142,7 @@ def _by_words(columns: list[tuple[str, ...]], i: int) -> str | None:
     return role or (EPISODE if all(_DATE.match(v) for v in columns[i]) else None)
 
 
-def _by_place(columns: list[tuple[str, ...]], varying: Sequence[int], left: Sequence[int], roles: Roles) -> None:
+def _by_place(columns: list[Names], varying: Sequence[int], left: Sequence[int], roles: Roles) -> None:
     """Set the roles that no word tells: units before conditions before episodes."""
     if UNIT not in roles:  # what differs in every file is no machine, unless nothing else differs
         repeated = [i for i in left if len(set(columns[i])) < len(columns[i]) or varying == [i]]

@@ -1,16 +1,14 @@
 """Columns of a table: units of measure, kinds of quantities, names of channels, and what they are likely to be."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core import Array, frozen
 from ..measures import KINDS, Measure, clean_unit, measure, split_header
 from ..recording import CHECK
 
@@ -51,7 +49,7 @@ class ColumnPart(str, Enum):
     LEFT_OUT = "left out"
 
 
-@dataclass(frozen=True)
+@frozen
 class TableColumn:
     """A column of the recordings."""
 
@@ -139,7 +137,7 @@ def time_scale(column: TableColumn, step: float) -> tuple[float, str]:
 
 def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[TableColumn]:
     """Return the columns with the part that each is likely to have; time is known already."""
-    proposed: list[TableColumn] = []
+    proposed = list[TableColumn]()
     for i, column in enumerate(columns):
         part, why = column.part, column.why
         if part is not ColumnPart.TIME:

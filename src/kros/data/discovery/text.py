@@ -1,18 +1,17 @@
 """What was found in a folder, as a mapping in TOML that people can read and correct."""
 
-from __future__ import annotations
-
 import json
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
+from ...core import ByName, Record
 from ..readers.csv_folder import CsvMapping
 from .discover import Discovery
 from .roles import ColumnPart, TableColumn
 
 
-def key_lines(table: Mapping[str, Any]) -> list[str]:
+def key_lines(table: ByName) -> list[str]:
     """Return the keys of a table."""
     return [f"{key} = {_value(value)}" for key, value in table.items()]
 
@@ -33,7 +32,7 @@ def mapping_lines(discovery: Discovery) -> Iterator[str]:
         yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))
 
 
-def _channel(table: Mapping[str, Any], column: TableColumn) -> Iterator[str]:
+def _channel(table: ByName, column: TableColumn) -> Iterator[str]:
     for key, value in table.items():
         note = {"role": column.why, "measured": "available at run time", "scale": "to " + column.unit}.get(key, "")
         yield _line(key, value, note)
@@ -49,7 +48,7 @@ def _value(value: Any) -> str:
     if isinstance(value, str):
         literal = "\\" in value and "'" not in value and value.isprintable()
         return f"'{value}'" if literal else json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, (list, tuple)):
+    if isinstance(value, list | tuple):
         return f"[{', '.join(_value(v) for v in value)}]"
     return repr(value)
 
@@ -61,5 +60,5 @@ def _one_line(text: str) -> str:
 def comment(text: str) -> list[str]:
     """Return a text as lines of comment."""
     later = "#   " if text.startswith("- ") else "# "
-    indents: dict[str, Any] = {"initial_indent": "# ", "subsequent_indent": later}
+    indents: Record = {"initial_indent": "# ", "subsequent_indent": later}
     return textwrap.wrap(_one_line(text), 118, break_on_hyphens=False, **indents)

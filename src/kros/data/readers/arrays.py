@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.errors import DataError
-from ...core.files import shortened
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
+from ...core import Array, ByName, DataError, frozen, shortened
+from ..population import DEFAULT_CONDITION, Channel, Channels, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_period, title
 
@@ -30,7 +28,7 @@ class ArrayRecordings(Recordings):
 
 def declare_channels(
     channels: Sequence[Channel] | None, states: Sequence[str], inputs: Sequence[str], measured: Sequence[str], what: str
-) -> tuple[Channel, ...]:
+) -> Channels:
     """Return the channels as given, or those that the names declare."""
     if (channels is None) != bool(states):
         actual = f"found states = {list(states)} and channels = {channels!r}"
@@ -41,9 +39,10 @@ def declare_channels(
         if isinstance(value, str):
             raise DataError(f"{what}: {name} should be a list of names, found the text {value!r}; write [{value!r}].")
     if not measured or not set(measured) <= set(states):
-        wanted = "measured should name the states that a running observer will be given"
-        actual = f"found {list(measured)} for the states {list(states)}"
-        raise DataError(f"{what}: {wanted}, {actual}; name one of them at least.")
+        raise DataError(
+            f"{what}: measured should name the states that a running observer will be given, found {list(measured)} "
+            f"for the states {list(states)}; name one of them at least."
+        )
     recorded = (Channel(s, Role.STATE, measured=s in measured) for s in states)
     return (*recorded, *(Channel(u, Role.INPUT) for u in inputs))
 
@@ -57,7 +56,7 @@ def from_arrays(
     inputs: Sequence[str] = (),
     measured: Sequence[str] = (),
     units: Iterable[Unit] = (),
-    metadata: Mapping[str, Any] | None = None,
+    metadata: ByName | None = None,
 ) -> Population:
     """Make a population from arrays.
 

@@ -16,12 +16,19 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
-from ...core.arrays import Array, frozen
-from ...core.errors import DataError
-from ...core.files import did_you_mean, read_toml
-from ...core.settings import Settings
+from ...core import Array, ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
 from ..measures import clean_unit, measure, split_header
-from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
+from ..population import (
+    DEFAULT_CONDITION,
+    Channel,
+    Channels,
+    EpisodeKey,
+    Population,
+    Role,
+    Scaling,
+    Unit,
+    columns_in_order,
+)
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import STEPS, Scale, Step
@@ -94,8 +101,8 @@ class CsvMapping(Settings):
     threshold: float = Field(
         0.5, description="of the trigger, in the column's unit; the default is for a flag of 0 and 1"
     )
-    prepare: tuple[dict[str, Any] | Step, ...] = Field((), description="preparation steps of this mapping")
-    metadata: dict[str, Any] = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
+    prepare: tuple[Record | Step, ...] = Field((), description="preparation steps of this mapping")
+    metadata: Record = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
 
     @field_validator("files", "exclude")
     @classmethod
@@ -124,9 +131,10 @@ class CsvMapping(Settings):
             actual = f"time = {self.time!r}, sample_period_s = {self.sample_period_s!r}"
             raise ValueError(f"give one of time and sample_period_s, found {actual}")
         if not (_is_mark(self.delimiter) and _is_mark(self.decimal)) or self.delimiter == self.decimal:
-            wanted = "two different characters of ASCII that stand in no number otherwise"
-            actual = f"delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
-            raise ValueError(f"delimiter and decimal should be {wanted}, found {actual}")
+            raise ValueError(
+                "delimiter and decimal should be two different characters of ASCII that stand in no number otherwise, "
+                f"found delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
+            )
         names = [c.name for c in self.channel]
         if not names:
             raise ValueError("there is no [[channel]]; declare each channel with name, column and role")
@@ -156,7 +164,7 @@ class CsvMapping(Settings):
         return columns_in_order(self.channel)
 
     @property
-    def channels(self) -> tuple[Channel, ...]:
+    def channels(self) -> Channels:
         """The population's channels."""
         return tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in self.ordered)
 
@@ -193,7 +201,7 @@ def _is_mark(text: str) -> bool:
     return len(text) == 1 and text.isascii() and not text.isalnum() and text not in '"+-\r\n\0'
 
 
-def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMapping:
+def load_mapping(mapping: CsvMapping | ByName | Path | str) -> CsvMapping:
     """Return a mapping from a TOML file or a table with the same keys."""
     if isinstance(mapping, CsvMapping):
         return mapping
@@ -202,7 +210,7 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
     return CsvMapping.of(read_toml(Path(mapping), "CSV mapping"), f"CSV mapping {mapping}")
 
 
-def mapping_schema() -> dict[str, Any]:
+def mapping_schema() -> Record:
     """Return the JSON schema of a mapping, with all preparation steps."""
     schema = CsvMapping.model_json_schema()
     steps = {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()}
@@ -222,8 +230,8 @@ class FilePlace:
     """Where an episode is: a file, its columns, the positions of those wanted (time first), rows, and which piece."""
 
     path: str
-    fields: tuple[str, ...]
-    wanted: tuple[int, ...]
+    fields: Names
+    wanted: Columns
     conversion: tuple[tuple[float, float], ...] = ()  # factor and offset of those wanted, where units differ
     rows: tuple[int, int] | None = None
     piece: tuple[int, int] = (0, 1)  # of how many
@@ -279,12 +287,12 @@ class CsvRecordings(Recordings):
 
 
 def read_csv_folder(
-    source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()
+    source: Path | str, mapping: CsvMapping | ByName | Path | str, optional: Collection[str] = ()
 ) -> Population:
     """Read a folder of CSV files, also gzip-compressed."""
     chosen, source = load_mapping(mapping), Path(source)
-    places: dict[EpisodeKey, FilePlace] = {}
-    groups: dict[str, str] = {}
+    places = dict[EpisodeKey, FilePlace]()
+    groups = dict[str, str]()
     for path, match in _matches(source, chosen):
         fields, stated = file_fields(path, chosen.dialect, chosen.declared)
         if optional and not places:

@@ -4,8 +4,6 @@ A format is a function that yields signals by name, nested as in the file, and t
 it, and the extra that installs what it needs, by the end of a file's name. Text is read in blocks, by `tables`.
 """
 
-from __future__ import annotations
-
 import gc
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -15,13 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from ...core import limits
-from ...core.arrays import Array
-from ...core.errors import DataError, MissingDependencyError
+from ...core import Array, ByName, DataError, MissingDependencyError, Record, limits
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of
 from ..recording import some
 
-Group = tuple[Mapping[str, Any], Mapping[str, str]]
+Group = tuple[ByName, Mapping[str, str]]
 
 
 def _matlab(path: Path) -> Iterator[Group]:
@@ -38,7 +34,7 @@ def _hdf5(path: Path) -> Iterator[Group]:
     """HDF5; a unit of measure is the attribute `units` or `unit` of a data set."""
     import h5py
 
-    content, units = dict[str, Any](), dict[str, str]()
+    content, units = Record(), dict[str, str]()
 
     def visit(place: str, item: Any) -> None:
         name, unit = place.replace("/", "."), item.attrs.get("units", item.attrs.get("unit", ""))
@@ -82,7 +78,7 @@ def _bag(path: Path) -> Iterator[Group]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    rows: dict[str, list[dict[str, Any]]] = {}
+    rows = dict[str, list[Record]]()
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
         for connection, stamp, raw in reader.messages():
             numbers = {"time": 1e-9 * (stamp - reader.start_time)}
@@ -148,7 +144,7 @@ def _tables(path: Path, version: tuple[int, int]) -> list[dict[str, tuple[Array,
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # asammdf fails to delete what it could not open
     try:
         for values, units in read(path):
-            by_length: dict[int, dict[str, tuple[Array, str]]] = {}
+            by_length = dict[int, dict[str, tuple[Array, str]]]()
             for name, signal in _signals("", values):
                 if signal.size > 1:
                     by_length.setdefault(len(signal), {})[name] = signal.astype(float), units.get(name, "")

@@ -7,16 +7,13 @@ full scale), target position (deg), target velocity (deg/s), all on the motor si
 declares the preparation.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path
 
 import numpy as np
 
-from ...core.errors import DataError
-from ...core.files import whole_folder
+from ...core import DataError, whole_folder
 from ..population import OUTLIERS, Channel, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim
 from .csv_folder import ChannelMapping, CsvMapping, csv_files, read_csv_folder

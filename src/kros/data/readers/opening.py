@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Any
 
-from ...core.errors import ConfigError, DataError
+from ...core import ByName, ConfigError, DataError
 from ..population import Population
 from ..prepare import parse_steps
 from ..prepare import prepare as prepared
@@ -31,8 +30,8 @@ def detect_reader(source: Path | str) -> str | None:
 def read(
     source: Path | str,
     reader: str | None = None,
-    mapping: CsvMapping | Mapping[str, Any] | Path | str | None = None,
-    prepare: Iterable[Step | Mapping[str, Any]] = (),
+    mapping: CsvMapping | ByName | Path | str | None = None,
+    prepare: Iterable[Step | ByName] = (),
     *,
     optional: Collection[str] = (),
 ) -> Population:

@@ -21,11 +21,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.artifacts import load_artifact, save_artifact, united
-from ...core.errors import DataError
+from ...core import Array, DataError, Names, Record, frozen, load_artifact, save_artifact, united
 from ...core.files import draft_beside, pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
-from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
+from ..population import Channels, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_structure, refuse_copies, usable_episodes
 from .tables import BLOCK, from_numpy, repeated, to_numpy
@@ -46,7 +44,7 @@ class ParquetRecordings(Recordings):
     """Reads one row group at a time; a place is a file, its row group and the number of samples."""
 
     folder: str
-    columns: tuple[str, ...]
+    columns: Names
 
     def file(self, place: Place) -> Path:
         """Return the file of a unit and condition."""
@@ -81,7 +79,7 @@ def _tables(path: Path, place: Place, columns: list[str], rows: int | None) -> I
     from pyarrow import parquet
 
     _, group, samples = place
-    options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
+    options: Record = {"pre_buffer": False, "page_checksum_verification": True}
     options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
     with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:
         actual, schema = file.metadata.row_group(group).num_rows, file.schema_arrow
@@ -161,9 +159,9 @@ class GroupRecord:
     unit: str
     condition: str
     file: str
-    episodes: tuple[str, ...]  # in the order of the row groups
+    episodes: Names  # in the order of the row groups
     samples: tuple[int, ...]  # length of each episode
-    digests: tuple[str, ...] = ()  # of all samples of each episode
+    digests: Names = ()  # of all samples of each episode
 
     @property
     def keys(self) -> list[EpisodeKey]:
@@ -176,17 +174,17 @@ class _Index:
     """Content of `population.json`."""
 
     sample_period_s: float
-    channels: tuple[Channel, ...]
+    channels: Channels
     units: tuple[Unit, ...]
-    metadata: dict[str, Any]
+    metadata: Record
     groups: tuple[GroupRecord, ...]
-    truths: tuple[Channel, ...] = ()
+    truths: Channels = ()
     scaling: dict[str, Scaling] = field(default_factory=dict)
 
 
 def _places(groups: Iterable[GroupRecord]) -> dict[EpisodeKey, Place]:
     """Return where every episode is."""
-    places: dict[EpisodeKey, Place] = {}
+    places = dict[EpisodeKey, Place]()
     for g in groups:
         if g.file in ("", ".", "..") or Path(g.file).name != g.file:
             raise ValueError(f"the file {g.file!r} is not beside the index")
@@ -227,7 +225,7 @@ def _write_episodes(population: Population, episodes: Episodes, path: Path) -> I
         raise DataError(f"Writing Parquet: {problem}; rename them.")
     kinds = dict.fromkeys(KEYS, pa.dictionary(pa.int32(), pa.string())) | {"k": pa.int64()}
     schema = pa.schema(kinds | dict.fromkeys(names, pa.float64()))
-    options: dict[str, Any] = {
+    options: Record = {
         "column_encoding": {"k": COUNTER, **dict.fromkeys(names, SIGNALS)},
         "compression": COMPRESSION,
         "use_dictionary": list(KEYS),

@@ -1,7 +1,5 @@
 """Numbers from one table of text, fast, in bounded memory, with errors that name the file and the column."""
 
-from __future__ import annotations
-
 import codecs
 import csv
 import gzip
@@ -15,9 +13,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from ...core import limits
-from ...core.arrays import AnyArray, Array
-from ...core.errors import DataError
+from ...core import AnyArray, Array, DataError, limits
 from ...core.files import pass_on_shortage, require_regular, shortened
 from ..measures import clean_unit, is_unit_row, split_header
 from .formats import columns_of, is_binary, values_of

@@ -1,7 +1,5 @@
 """The methods of observer design, from the plainest to the one that is preferred where others are as accurate."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 

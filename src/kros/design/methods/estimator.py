@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
-from ...observer import EstimatorSettings, Recordings, Seen, identify_estimator
-from ...observer.sensor import Sensor
+from ...core import frozen
+from ...observer import EstimatorSettings, Recordings, Seen, Sensor, identify_estimator
 from ...synthesis import Status, Synthesis
 from ..task import Design, DesignTask, Label, Method
 
 
-@dataclass(frozen=True)
+@frozen
 class Estimator(Method):
     """Regression on filtered measurements and inputs; it is trained with the declared sensors."""
 

@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array
-from ...core.errors import SynthesisError
-from ...core.lti import gain
+from ...core import Array, SynthesisError, frozen, gain
 from ...observer.residual import (
     like_measurement_noise,
     mean_error_dynamics,
@@ -30,7 +28,7 @@ from ..task import Design, DesignTask, Label, Method
 from ..validation import hidden_mean, percent_of
 
 
-@dataclass(frozen=True)
+@frozen
 class OpenLoop(Method):
     """The nominal model without correction."""
 
@@ -42,7 +40,7 @@ class OpenLoop(Method):
         return task.designed(task.open_loop())
 
 
-@dataclass(frozen=True)
+@frozen
 class KalmanTuned(Method):
     """The Kalman filter of a model fitted to single steps, whose process noise does best in training."""
 
@@ -86,7 +84,7 @@ def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:
     return replace(synthesis, controller=gain(np.vstack([K.D, np.zeros((n_lifted - len(K.D), K.n_inputs))]), K.dt))
 
 
-@dataclass(frozen=True)
+@frozen
 class ResidualH2(Method):
     """Kalman gains for the one-step residuals that a model leaves on the training episodes of all units."""
 
@@ -103,8 +101,9 @@ class ResidualH2(Method):
         tried = residual_models(*nominal, task.training.read(), task.noise, scale)
         models = [model for model in tried if np.isfinite(model.promised).all()][: self.compared]
         if not models:
-            problem = "no model promises bounded errors; check what is measured and the recordings"
-            raise SynthesisError(f"Residual-shaped observer: {problem}.")
+            raise SynthesisError(
+                "Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings."
+            )
         problems = [ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
         lifted, order = given.lifting.n_lifted, self.max_order
         syntheses = [residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]

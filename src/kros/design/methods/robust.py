@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from ... import synthesis  # solvers load when they are used
-from ...core.errors import SynthesisError
-from ...core.lti import StateSpace, block_diagonal, gain
+from ...core import Record, StateSpace, SynthesisError, block_diagonal, frozen, gain
 from ...identify.model_set import EDMD
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...uncertainty import residual
@@ -20,7 +18,7 @@ from ...uncertainty.unit_residuals import EntryWeights, fit_entries
 from ..task import Design, DesignTask, Label, Method
 
 
-@dataclass(frozen=True)
+@frozen
 class Mixed(Method):
     """The paper's mixed H2/H-infinity problem on the reduced, regularised plant, corrected through the input."""
 
@@ -38,7 +36,7 @@ class Mixed(Method):
         return task.designed(synthesis.mixed(problem, steps=self.steps))
 
 
-@dataclass(frozen=True)
+@frozen
 class Published(Mixed):
     """The mixed problem with a weight for every entry of the residual, as in the paper's Figures 8 and 10."""
 
@@ -51,7 +49,7 @@ class Published(Mixed):
         weights = self.weights(task)
         solved = synthesis.mixed(as_published(task.require_problem(), weights.system), steps=self.steps)
         note = f"The weights bound entries: a full perturbation exceeds them {weights.excess:.3g} times."
-        nothing: dict[str, Any] = {"worst_case_h2": None, "quadrature_error": None}
+        nothing: Record = {"worst_case_h2": None, "quadrature_error": None}
         published = replace(solved, method=self.name, notes=(*solved.notes, note), **nothing)
         return task.designed(published, unstructured_excess=weights.excess)
 
@@ -70,7 +68,7 @@ def as_published(problem: ObserverProblem, weight: StateSpace) -> ObserverProble
     return replace(problem, W_L=weight, W_R=one, remainder_left=None, remainder_right=None, injection=Injection.INPUT)
 
 
-@dataclass(frozen=True)
+@frozen
 class Disturbances:
     """What is assumed about the disturbances of a machine."""
 
@@ -88,13 +86,13 @@ class Disturbances:
         lowpass = StateSpace(pole, 1 - pole, pole, 1 - pole, problem.nominal.dt)
         return replace(problem, W_u=block_diagonal([lowpass] * problem.nominal.n_inputs))
 
-    def facts(self, dt: float) -> dict[str, Any]:
+    def facts(self, dt: float) -> Record:
         """Return them for the metrics."""
         hz = None if self.corner is None else self.corner / dt
         return {"input_weight_hz": hz, "process_noise": self.process_noise, "measurement_noise": self.measurement_noise}
 
 
-@dataclass(frozen=True)
+@frozen
 class WorstCaseH2(Method):
     """Worst-case H2 with the disturbances whose observer does best on training episodes."""
 

@@ -1,4 +1,4 @@
-"""Loops that a controller closes over estimates: stability and worst errors for every unit and for the uncertain set."""
+"""Loops that a controller closes over estimates: stability and worst errors for all units and for the uncertain set."""
 
 from .controller import Controller
 from .verdict import LoopResult, close_loop

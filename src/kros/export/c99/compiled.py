@@ -7,12 +7,11 @@ import json
 import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Bits
-from ...core.errors import ConfigError, DimensionError
+from ...core import AnyArray, Array, Bits, ByName, ConfigError, DimensionError
 from ...loops.compiler import COMPILERS, compile_library, find_compiler
 
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")
@@ -111,8 +110,10 @@ class CompiledObserver:
         """
         y, u = np.ascontiguousarray(y, dtype=float), np.ascontiguousarray(u, dtype=float)
         if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or (y.shape[1], u.shape[1]) != (self._q, self._m):
-            problem = f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m})"
-            raise DimensionError(f"{problem}, found {y.shape} and {u.shape}.")
+            raise DimensionError(
+                f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and "
+                f"{u.shape}."
+            )
         machine = self.start(y[0], parameters) if machine is None else machine
         x_hat, status = np.empty((len(y), len(self.states))), np.empty(len(y), dtype=np.uint32)
         self._run(_at(machine), ctypes.c_long(len(y)), *(_at(array) for array in (y, u, x_hat, status)))
@@ -128,7 +129,7 @@ class CompiledObserver:
         return machine
 
 
-def _wide(manifest: Mapping[str, Any]) -> str:
+def _wide(manifest: ByName) -> str:
     """Return the ending of the functions that take and give doubles."""
     return "_wide" if manifest["precision"] == "float" else ""
 

@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.errors import ConfigError
+from ...core import Array, ConfigError, Record, frozen
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
-from ...observer import Observer
+from ...observer import Observer, recorded_channel, recorded_factors
 from ...observer.filter_bank import longest_age
 from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
-from ...observer.units import recorded_channel, recorded_factors
-from ..text import plain, plain_names, rendered, require_identifier
+from ..text import plain, plain_names, require_identifier
 from .origin import OriginShift, find_shift
 from .realise import RULE, realised
-
-Named = dict[str, Any]  # what templates name
 
 TOLERANCE = {"double": 1e-9, "float": 1e-3}  # of golden vectors
 DOUBLE, SINGLE = Precision(), Precision("float")
 
 
-@dataclass(frozen=True)
+@frozen
 class LoadOutput:
     """Load torque and total current with their levels as outputs (`AngleLoad`), of an observer that estimates a load.
 
@@ -80,13 +75,17 @@ class Source:
         shift = find_shift(observer) if precision == "float" else None
         return cls(observer, name, Precision(precision), shift, loop, load)
 
-    def rendered(self, package: str, files: Mapping[str, str], more: Named) -> dict[str, str]:
+    def rendered(self, package: str, files: Mapping[str, str], more: Record) -> dict[str, str]:
         """Return the text of every file, by its name and that of its template in a package."""
-        filters = {"row": self.row, "sums": self.sums, "literal": self.precision.literal, "code": self.code}
-        filters |= {"double": DOUBLE.literal, "wide": row, "plain": plain}
-        return rendered(package, files, self.context() | more, filters)
+        from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    def context(self) -> Named:
+        environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
+        filters = {"row": self.row, "sums": self.sums, "literal": self.precision.literal, "code": self.code}
+        environment.filters |= filters | {"double": DOUBLE.literal, "wide": row, "plain": plain}
+        context = self.context() | more
+        return {file: environment.get_template(f"{name}.jinja").render(context) for file, name in files.items()}
+
+    def context(self) -> Record:
         """Return what the templates name: the observer and its parts, names, sizes, and matrices."""
         o, lifting, loop, factors = self.observer, self.observer.lifting, self.loop, self.factors()
         low, high = bounds(o.guard, lifting.n_states, o.controller.n_states)
@@ -134,7 +133,7 @@ class Source:
         moving = [] if self.shift is None else np.flatnonzero(self.shift.states[: len(self.observer.recorded)]).tolist()
         return [i for i in moving if i != self.observer.measured[0]]
 
-    def linear(self) -> Named:
+    def linear(self) -> Record:
         """Return the model and the correction, zeros left out."""
         o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
         parts = np.hstack([o.A, o.B])[:n], o.into[:n] @ np.hstack([K.C, K.D]), np.hstack([K.A, K.B])
@@ -161,7 +160,7 @@ class Source:
         """Return the literals of factors in double precision; none where all are one."""
         return [] if all(factor == 1 for factor in factors) else row(np.array(factors))
 
-    def tracked(self, loop: PhaseLockedLoop) -> Named:
+    def tracked(self, loop: PhaseLockedLoop) -> Record:
         """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""
         o, name, n, states = self.observer, loop.name, self.observer.lifting.n_states, self.observer.lifting.states
         slopes, given = [], () if o.bank is None else o.measured  # measurements take the place of estimates
@@ -182,7 +181,7 @@ class Source:
             "most": self.precision.literal(MOST),
         }
 
-    def load_torque(self) -> Named | None:
+    def load_torque(self) -> Record | None:
         """Return the numbers of `AngleLoad`."""
         if self.load is None:
             return None

@@ -11,15 +11,12 @@ model, since there are more signals than equations; the smallest one is taken. G
 single precision runs so; double precision does without.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.rounding import EPS, ITERATED, TINY
+from ...core import EPS, ITERATED, TINY, Array, frozen
 from ...lifting import Lifting
 from ...observer.data import ObserverData
 from .realise import RULE

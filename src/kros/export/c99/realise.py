@@ -3,14 +3,12 @@
 Internal states are in a real block diagonal form: two multiplications each in place of one for every other state.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.rounding import ROUNDING
+from ...core import ROUNDING, Array, frozen
+from ...core.linalg import balanced_size
 from ...observer import Observer
 from ...observer.units import in_coordinates
 
@@ -46,10 +44,8 @@ def realised(observer: Observer) -> Observer:
 
 def to_modes(observer: Observer) -> Array:
     """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted)."""
-    from scipy.linalg import matrix_balance
-
     n, turn = observer.lifting.n_states, np.eye(observer.lifting.n_lifted)
-    _, (scale, _) = matrix_balance(observer.A[:n, :n], permute=False, separate=True)
+    scale = balanced_size(observer.A[:n, :n])
     for part in _parts(observer):
         turn[part, part] = _modes(observer.A[part, part], scale[part])
     return turn

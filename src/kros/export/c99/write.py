@@ -5,14 +5,12 @@ from __future__ import annotations
 import hashlib
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.arrays import AnyArray, Array, frozen
+from ...core import AnyArray, Array, Record, frozen, whole_folder, write_bytes
 from ...core.artifacts import json_bytes, with_checksum
-from ...core.files import whole_folder, write_bytes
 from ...observer import Observer
 from ...observer.file import observer_content
 from .numbers import TOLERANCE, LoadOutput, Source
@@ -88,7 +86,7 @@ def c_files(observer: Observer, source: Source) -> dict[str, str]:
     return source.rendered("kros.export.c99", texts, more) | {"manifest.json": json_bytes(manifest).decode()}
 
 
-def _golden(observer: Observer, source: Source, track: str | None) -> dict[str, Any]:
+def _golden(observer: Observer, source: Source, track: str | None) -> Record:
     """Return the literals of golden vectors in the units of the recordings, and their tolerance."""
     tolerance, factors = TOLERANCE[source.precision.type], source.factors()
     golden = Golden.of(observer, track, tolerance=tolerance)
@@ -111,7 +109,7 @@ def _golden(observer: Observer, source: Source, track: str | None) -> dict[str, 
     return {"golden": literals, "tolerance": tolerance}
 
 
-def _manifest(observer: Observer, source: Source, state_bytes: int) -> dict[str, Any]:
+def _manifest(observer: Observer, source: Source, state_bytes: int) -> Record:
     deployed = json_bytes(with_checksum(observer_content(observer)))
     return {
         "name": source.name,

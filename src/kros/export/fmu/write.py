@@ -13,13 +13,10 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
-from ...core.errors import ConfigError
-from ...core.files import write_bytes
+from ...core import ConfigError, Record, write_bytes
 from ...loops.compiler import compile_library, find_compiler
-from ...observer import Observer
-from ...observer.units import recorded_channel
+from ...observer import Observer, recorded_channel
 from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
 from ..c99.write import c_files
@@ -114,7 +111,7 @@ def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
     return source.rendered("kros.export.fmu", files, more)
 
 
-def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[str]) -> list[dict[str, Any]]:
+def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[str]) -> list[Record]:
     """Return the variables in the order of their references, measurements first."""
     bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate, 16 restarted"
     of_parameters = {name: f"{observer.parameters.get(name, 0.0):.17g}" for name in observer.lifting.parameters}
@@ -122,7 +119,7 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
     every += [(name, "input", "input {}", "0.0") for name in observer.inputs]
     every += [(name, "parameter", "this machine's {}", start) for name, start in of_parameters.items()]
     outputs = [(name, "output", "estimate of {} at the end of the step", None) for name in estimates]
-    rows: list[dict[str, Any]] = []
+    rows = list[Record]()
     for index, (name, causality, text, start) in enumerate([*every, *outputs, ("status", "output", bits, None)]):
         shown = plain(name)
         row = {"name": f"{shown}_hat" if text.startswith("estimate") else shown, "causality": causality, "start": start}

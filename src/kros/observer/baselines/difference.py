@@ -8,9 +8,8 @@ from itertools import product
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters, frozen
-from ...data import EpisodeBatch
-from ...data.batch import hold_missing
+from ...core import Array, Parameters, frozen
+from ...data import EpisodeBatch, hold_missing
 
 
 @frozen

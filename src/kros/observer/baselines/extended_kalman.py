@@ -14,15 +14,12 @@ References
 B. D. O. Anderson and J. B. Moore, Optimal Filtering, Prentice-Hall 1979, section 8.2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters, frozen
-from ...core.errors import DimensionError
+from ...core import Array, Columns, DimensionError, Parameters, frozen
 from ...lifting import Lifting
 
 
@@ -33,7 +30,7 @@ class ExtendedKalman:
     lifting: Lifting
     A: Array  # (n_lifted, n_lifted)
     B: Array  # (n_lifted, m), with input functions
-    measured: tuple[int, ...]
+    measured: Columns
     Q: Array  # (n, n), process noise of the original states; or (k, n, n) for k filters at once
     R: Array  # (q, q), measurement noise
     P0: Array  # (n, n), of the first estimate

@@ -15,11 +15,8 @@ from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
-from ...core.arrays import Array, Parameters, Whole, frozen
-from ...core.errors import DataError
-from ...core.rounding import TINY
-from ...data import EpisodeBatch
-from ...data.batch import hold_missing
+from ...core import TINY, Array, Columns, DataError, Names, Parameters, Whole, frozen
+from ...data import EpisodeBatch, hold_missing
 
 
 @frozen
@@ -35,8 +32,8 @@ class Ridge:
 class Learned:
     """The trained estimator."""
 
-    measured: tuple[int, ...]
-    estimated: tuple[int, ...]
+    measured: Columns
+    estimated: Columns
     constant: Array  # (h,)
     weights: Array  # (delays, q + m, h): the latest sample first
 
@@ -58,9 +55,9 @@ class Moments:
     """Products of regressors and hidden states, summed over the episodes of every unit: a unit can be left out."""
 
     settings: Ridge
-    measured: tuple[int, ...]
-    estimated: tuple[int, ...]
-    units: tuple[str, ...]
+    measured: Columns
+    estimated: Columns
+    units: Names
     products: Array  # (unit, 1 + f + h, 1 + f + h)
 
     @classmethod
@@ -69,7 +66,7 @@ class Moments:
     ) -> Moments:
         """Collect every so many rows of training episodes."""
         settings, total = settings or Ridge(), dict[str, Array]()
-        estimated: tuple[int, ...] = ()
+        estimated: Columns = ()
         for batch in batches:
             estimated = tuple(i for i in range(batch.states.shape[-1]) if i not in measured)
             y = hold_missing(batch.measurements(measured))

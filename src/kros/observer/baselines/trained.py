@@ -7,10 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Parameters, frozen
-from ...core.errors import DataError, MissingDependencyError
-from ...data import EpisodeBatch
-from ...data.batch import hold_missing
+from ...core import AnyArray, Array, DataError, MissingDependencyError, Parameters, frozen
+from ...data import EpisodeBatch, hold_missing
 
 Regressor = Literal["boosting", "network"]
 
@@ -94,8 +92,9 @@ def regressor_of(kind: Regressor) -> Any:
     try:
         from sklearn import compose, ensemble, neural_network, pipeline, preprocessing
     except ImportError as error:
-        problem = f"the baseline {kind} needs scikit-learn, which is not installed"
-        raise MissingDependencyError(f"Regression: {problem}; pip install 'kros[sklearn]'.") from error
+        raise MissingDependencyError(
+            f"Regression: the baseline {kind} needs scikit-learn, which is not installed; pip install 'kros[sklearn]'."
+        ) from error
     if kind == "boosting":
         return ensemble.HistGradientBoostingRegressor(max_iter=500, early_stopping=True, random_state=0)
     layers = neural_network.MLPRegressor(hidden_layer_sizes=(64, 64), early_stopping=True, max_iter=300, random_state=0)

@@ -16,8 +16,7 @@ from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.artifacts import Storable
+from ...core import Array, Names, Storable, frozen
 from ...lifting.intervals import Box
 from ..data import ObserverData
 from ..units import factors
@@ -93,7 +92,7 @@ class ReliftCertificate(Storable):
 
     KIND = "relift"
     scales: ReliftScales
-    assumptions: tuple[str, ...]
+    assumptions: Names
     box: Mapping[str, float | tuple[float, float] | Array]
     parameters: Mapping[str, float | tuple[float, float] | Array]
     status: ReliftStatus = ReliftStatus.UNBOUNDED
@@ -103,7 +102,7 @@ class ReliftCertificate(Storable):
     start: Array = field(default_factory=lambda: np.zeros((0, 0)))
     root: Array = field(default_factory=lambda: np.zeros((0, 0)))
     multipliers: Array = field(default_factory=lambda: np.zeros(0))
-    channels: tuple[str, ...] = ()
+    channels: Names = ()
 
     @property
     def certified(self) -> bool:
@@ -135,10 +134,7 @@ class ReliftCertificate(Storable):
 
 
 def relift_certificate(
-    observer: ObserverData,
-    box: Box | None = None,
-    scales: ReliftScales | None = None,
-    parameters: Box | None = None,
+    observer: ObserverData, box: Box | None = None, scales: ReliftScales | None = None, parameters: Box | None = None
 ) -> ReliftCertificate:
     """Certify an observer at run time, with any lifting of bounded slopes and any correction.
 
@@ -194,7 +190,7 @@ def relift_certificate(
     )
 
 
-def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None) -> tuple[str, ...]:
+def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None) -> Names:
     """Return what has to hold, in words."""
     found = ["the machine and the observer have the same inputs", "machine and observer lift with the same parameters"]
     if parameters:

@@ -27,10 +27,7 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike, frozen
-from ...core.errors import DataError, DimensionError, KrosError
-from ...core.lti import StateSpace
-from ...core.rounding import EPS, ROUNDING
+from ...core import EPS, ROUNDING, Array, ArrayLike, DataError, DimensionError, KrosError, Names, StateSpace, frozen
 from ...lifting.formula import delayed_name
 from ...lifting.intervals import Box, break_of, slope_bounds_of
 from ..checked import floats
@@ -106,7 +103,7 @@ class ErrorSystem:
     D: Array  # (n_p, n_w)
     C: Array  # (n_z, n_xi)
     dt: float  # s
-    channels: tuple[str, ...] = ()  # what moves in every channel, for people
+    channels: Names = ()  # what moves in every channel, for people
     E: Array | float = 0.0  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
     start: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n_xi, n_window): where the first error goes
 
@@ -134,10 +131,7 @@ class ErrorSystem:
 
 
 def error_system(
-    observer: ObserverData,
-    scales: ReliftScales | None = None,
-    box: Box | None = None,
-    parameters: Box | None = None,
+    observer: ObserverData, scales: ReliftScales | None = None, box: Box | None = None, parameters: Box | None = None
 ) -> ErrorSystem:
     """Return the error dynamics of an observer at run time, its delay included."""
     return _Assembly(observer, scales or ReliftScales.ones(observer), box, parameters).system()

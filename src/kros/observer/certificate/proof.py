@@ -21,17 +21,13 @@ E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian e
 22 (1968) 565-578.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, frozen
-from ...core.lti import StateSpace
+from ...core import EPS, ITERATED, ROUNDING, TINY, AnyArray, Array, StateSpace, frozen
 from ...core.norms import first_frequencies, gramian, hinf_norm, to_continuous
-from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 from .error import ErrorSystem
 
 

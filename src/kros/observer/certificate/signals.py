@@ -11,18 +11,14 @@ holds for any slopes in their box. The right side is convex in w and the same fo
 units bounds the error for every ``sum_i a_i w_i``, ``sum_i |a_i| <= 1``, of their recordings at any times.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Parameters, Whole, frozen
-from ...core.rounding import AGREED, TINY
+from ...core import AGREED, TINY, Array, Flags, Names, Parameters, Record, frozen
 from ...data import EpisodeBatch
-from ...loops.library import recursion
+from ...loops import recursion
 from ..data import ObserverData
 from ..residual import one_step_residual
 from ..screen import screened
@@ -36,13 +32,13 @@ from .proof import proven_gain
 class SignalBound:
     """Bounds on the errors of one observer at run time, in the units of measure of the batch."""
 
-    states: tuple[str, ...]  # of the recordings
-    units: tuple[str, ...]
+    states: Names  # of the recordings
+    units: Names
     bounds: Array  # (units, n), on RMS errors for what the recordings of a unit hold; infinite where there is none
     errors: Array  # (units, n), RMS errors as they were
     sizes: Array  # (n,), ranges of the states
     reason: str = ""  # why there is no bound
-    outside: tuple[str, ...] = ()  # units of which the observer refuses samples as implausible; their rows are infinite
+    outside: Names = ()  # units of which the observer refuses samples as implausible; their rows are infinite
 
     @property
     def cover(self) -> Array:
@@ -66,7 +62,7 @@ class SignalBound:
         values = 100 * self.cover / self.sizes
         return {name: float(v) if np.isfinite(v) else None for name, v in zip(self.states, values, strict=True)}
 
-    def facts(self, measured: Sequence[int] = ()) -> dict[str, Any]:
+    def facts(self, measured: Sequence[int] = ()) -> Record:
         """Return what goes into the metrics; ratios are those of hidden states, of all where none is."""
         if not self.certified:
             return {"set_certified": False, "set_reason": self.reason}
@@ -90,7 +86,9 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
     member /= member.sum(axis=1, keepdims=True)
 
     def rms(signal: Array) -> Array:
-        return np.sqrt(member @ seen.mean_square(signal))
+        """Return the RMS of every channel over the episodes of every unit, shape (unit, k)."""
+        inside = np.where(batch.inside[: len(signal), :, None], signal, 0.0)
+        return np.sqrt(member @ (np.sum(inside**2, axis=0) / batch.lengths[:, None]))
 
     errors = rms(seen.error[..., :n] + seen.beyond)
     result = SignalBound(observer.recorded, units, np.full(errors.shape, np.inf), errors, sizes)
@@ -137,14 +135,8 @@ class Course:
     noise: Array  # (n_samples - 1, batch, q): what the sensor shows beside the recording, as it arrives
     first: Array  # (batch, n_window): first error, with the earlier ones that the lifting reads, which equal it
     error: Array  # (n_samples, batch, n)
-    lengths: Whole  # (batch,)
     refused: Flags  # (batch,): whether the observer refuses a sample
     beyond: Array  # (n_samples, batch, n_recorded): what recorded states are beyond declared limits, by noise
-
-    def mean_square(self, signal: Array) -> Array:
-        """Return the mean square of every channel over every episode, shape (batch, k)."""
-        inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
-        return np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None]
 
 
 def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
@@ -163,7 +155,7 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     noise[:late] = 0.0
     omega = held_residual(observer, states, inputs, values)
     first = first_error(observer, states[0] - observer.initial(samples.y[0], values))
-    return Course(omega, noise, first, states - estimates, batch.lengths, refused, batch.states - states)
+    return Course(omega, noise, first, states - estimates, refused, batch.states - states)
 
 
 def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Parameters) -> Array:

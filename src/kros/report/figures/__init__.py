@@ -3,28 +3,25 @@
 The function of a row takes a `RunFolder` and the options of the row; it returns the figure and more of its caption.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import field
 from importlib import import_module
 from typing import Any
 
-from ...core.arrays import frozen
-from ...core.errors import ConfigError
+from ...core import ByName, ConfigError, frozen
 from ..canvas import Figure
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
 
 
-@dataclass(frozen=True)
+@frozen
 class Row:
     """A figure: its title, the module and function that draw it, the first sentence of its caption, and options."""
 
     title: str
     function: str
     see: str
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: ByName = field(default_factory=dict)
 
 
 _SMALL = "The smaller the error, the better the estimate."

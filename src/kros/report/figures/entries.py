@@ -1,14 +1,12 @@
 """Residuals of every unit, entry by entry, with their bound and its fit."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...identify import ModelSet
 from ...uncertainty import Form
 from ...uncertainty.unit_residuals import UnitResiduals
-from ..canvas import Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
+from ..canvas import Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note, set_titles
 from ..names import model_label, shorten, words
 from ..theme import DRAWING, Tone
 
@@ -65,18 +63,15 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
     for i, row in enumerate(block):
         for j, panel in enumerate(row):
             panel.axis("on")
-            lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE.light, "units", units)
-            panel.plot(
-                freqs, bound[:, i, j], color=Tone.BLUE.light, lw=DRAWING.broad, alpha=DRAWING.shade, label="largest"
-            )
-            panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, label="fitted weight")
+            lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE, "units", units)
+            panel.plot(freqs, bound[:, i, j], color=Tone.BLUE, lw=DRAWING.broad, alpha=DRAWING.shade, label="largest")
+            panel.plot(freqs, fitted[:, i, j], color=Tone.INK, label="fitted weight")
             if alarm in residuals.unit_ids:
                 line = levels[residuals.unit_ids.index(str(alarm)), ..., i, j]
-                panel.plot(freqs, line, color=Tone.ALARM.light, label=f"unit {alarm}")
+                panel.plot(freqs, line, color=Tone.ALARM, label=f"unit {alarm}")
             frequency_axis(panel, freqs, "")
             order = f"order {residuals.entry_orders[i, j]}"
-            note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT.light)
+            note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT)
         row[0].set_ylabel(f"to\n{short(names[0][i])}\n(dB)")
-    for j, panel in enumerate(block[0]):
-        panel.set_title(f"{label},\nfrom {short(names[1][j])}")
+    set_titles(block[0], (f"{label},\nfrom {short(name)}" for name in names[1]))
     label_below(block[-1])

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray
-from ...core.errors import ConfigError
-from ...data import EpisodeBatch
-from ...data.population import Channel, EpisodeKey, Population, Role
+from ...core import AnyArray, ConfigError, frozen
+from ...data import Channel, EpisodeBatch, EpisodeKey, Population, Role
 from ...evaluate import fit_percent
 from ...evaluate.errors import error_spectrum
 from ...evaluate.held_out import HeldOut, as_shown
-from ...identify.identified import IdentifiedModels
+from ...identify import IdentifiedModels
 from ...observer import run_observer
-from ..canvas import Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin
+from ..canvas import Axes, Captioned, Figure, frequency_axis, grid, label_below, legend, logarithmic, set_titles, thin
 from ..names import (
     Look,
     condition_label,
@@ -41,28 +38,27 @@ from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
 
 Lines = Mapping[str, tuple[AnyArray, Look]]
-TRUTH = Look(Tone.INK.light, weight=2, opacity=DRAWING.shade)
+TRUTH = Look(Tone.INK, weight=2, opacity=DRAWING.shade)
 _PAPER = "The paper's observers: mixed H2-H∞ synthesis on models of EDMD. "
 
 
-@dataclass(frozen=True)
+@frozen
 class Signals:
     """What the signals of a figure are: channels, sampling period, samples of the enlarged part, gearbox band."""
 
     channels: Sequence[Channel]
     sample_period_s: float
     window: int
-    band_hz: tuple[float, float] | None = None
+    band_hz: Sequence[float] | None = None
 
     @classmethod
     def of(cls, run: RunFolder) -> Signals:
         """Return those of a run; the enlarged part has some turns of the gearbox, else an eighth of the episode."""
         size = DRAWING.zoom if run.has("calibration/calibration.json") else len(run.shown[0].time_s) // 8
-        band = run.evaluation.get("band_hz")
-        return cls(run.channels, run.sample_period_s, size, None if band is None else tuple(band))
+        return cls(run.channels, run.sample_period_s, size, run.evaluation.get("band_hz"))
 
 
-@dataclass(frozen=True)
+@frozen
 class Block:
     """One episode in a figure: its title, what is drawn beside the recorded signals, and of which states."""
 
@@ -72,7 +68,7 @@ class Block:
     states: Sequence[int]
 
 
-def free_run(run: RunFolder) -> tuple[Figure, str]:
+def free_run(run: RunFolder) -> Captioned:
     """Draw the simulation of a held-out episode of the nominal unit (the paper's Figures 5 and 6)."""
     shown = run.shown[0]
     if not shown.models:
@@ -83,7 +79,7 @@ def free_run(run: RunFolder) -> tuple[Figure, str]:
     return _figure(run, [block], text)
 
 
-def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
+def estimates(run: RunFolder, paper: bool = False) -> Captioned:
     """Draw estimates for the nominal and the worst off-nominal unit (the paper's Figures 11 and 12)."""
     shown = [s for s in run.shown if s.key.condition == run.identify_on][:2]
     if not shown or not shown[0].observers:
@@ -102,7 +98,7 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
     return _figure(run, blocks, text)
 
 
-def other_condition(run: RunFolder) -> tuple[Figure, str]:
+def other_condition(run: RunFolder) -> Captioned:
     """Draw the paper's observers, or the deployed one, in a condition that no model has seen (Figures 13 and 14)."""
     shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
     if shown is None or not shown.observers:
@@ -120,7 +116,7 @@ def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[i
     return Block(title, shown, lines, states)
 
 
-def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> tuple[Figure, str]:
+def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> Captioned:
     """Return the figure of some episodes of a run and its caption."""
     signals = Signals.of(run)
     text += " Shaded: the band around the gearbox frequency at top speed." if signals.band_hz else ""
@@ -140,8 +136,7 @@ def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:
         label_rows(panels[:, 0], [signals.channels[i] for i in block.states])
         hide_times(panels[:-1, :3].ravel())
         label_below(panels[-1, :3], "time (s)")
-        for column, title in ((0, block.title), (2, "error"), (3, "PSD of the error")):
-            panels[0, column].set_title(title)
+        set_titles(panels[0, [0, 2, 3]], (block.title, "error", "PSD of the error"))
     label_below(axes[-1, 3:])
     figure.align_ylabels(axes[:, 0])
     legend(figure, axes[0, 0])
@@ -153,21 +148,21 @@ def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, win
     time_s, recorded = block.shown.time_s, block.shown.states[:, i].astype(float)
     start = int(DRAWING.settled * len(recorded))
     for panel, part in ((row[0], slice(None)), (row[1], window)):
-        draw_lines(panel, time_s[part], {"recorded": (recorded[part], TRUTH)})
+        draw_line(panel, time_s[part], recorded[part], TRUTH, "recorded")
         for label, (values, look) in block.lines.items():
-            draw_lines(panel, time_s[part], {label: (_inside(values[part, i], recorded), look)})
-    row[0].axvspan(*time_s[window][[0, -1]], color=Tone.GRID.light, lw=0, zorder=0.5)
-    for label, (values, look) in block.lines.items():
+            draw_line(panel, time_s[part], _inside(values[part, i], recorded), look, label)
+    row[0].axvspan(*time_s[window][[0, -1]], color=Tone.GRID, lw=0, zorder=0.5)
+    for values, look in block.lines.values():
         error = recorded - values[:, i].astype(float)
         if np.isfinite(error).all() and np.abs(error[start:]).max() < DRAWING.diverged * np.ptp(recorded):
-            draw_lines(row[2], time_s[start:], {label: (error[start:], look)})
+            draw_line(row[2], time_s[start:], error[start:], look)
             freqs, density = error_spectrum(error, signals.sample_period_s)
             row[3].plot(freqs[1:], density[1:], look.style, color=look.colour)
             frequency_axis(row[3], freqs, "")
     logarithmic(row[3])
     row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size="small")
     if signals.band_hz is not None:
-        row[3].axvspan(*signals.band_hz, color=Tone.GRID.light, lw=0, zorder=0.5)
+        row[3].axvspan(*signals.band_hz, color=Tone.GRID, lw=0, zorder=0.5)
 
 
 def _inside(values: AnyArray, recorded: AnyArray) -> AnyArray:
@@ -176,11 +171,10 @@ def _inside(values: AnyArray, recorded: AnyArray) -> AnyArray:
     return np.where((values >= recorded.min() - room) & (values <= recorded.max() + room), values, np.nan)
 
 
-def draw_lines(axes: Axes, time_s: AnyArray, lines: Lines) -> None:
-    """Draw lines over time, later ones in front."""
-    for label, (values, look) in lines.items():
-        x, y = thin(time_s, values)
-        axes.plot(x, y, look.style, color=look.colour, alpha=look.opacity, label=label, lw=look.weight)
+def draw_line(axes: Axes, time_s: AnyArray, values: AnyArray, look: Look, label: str | None = None) -> None:
+    """Draw a line over time, in front of earlier ones."""
+    x, y = thin(time_s, values)
+    axes.plot(x, y, look.style, color=look.colour, alpha=look.opacity, label=label, lw=look.weight)
     axes.set_xlim(time_s[0], time_s[-1])
 
 
@@ -212,18 +206,15 @@ def steady_window(signals: Signals, shown: Shown) -> slice:
     columns, samples = references(signals.channels), len(shown.time_s)
     size = max(min(signals.window, samples), 2)
     first = np.abs(shown.inputs[:, columns["velocity"]]).argmax() if "velocity" in columns else (samples - size) // 2
-    return slice(min(int(first), samples - size), min(int(first), samples - size) + size)
+    begin = min(int(first), samples - size)
+    return slice(begin, begin + size)
 
 
-def steady_stretches(speed: AnyArray) -> list[tuple[int, int]]:
+def steady_stretches(speed: AnyArray) -> list[slice]:
     """Return all stretches within 2 % of the highest speed, each of one direction."""
     top = float(np.max(np.abs(speed), initial=0.0))
-    stretches: list[tuple[int, int]] = []
-    for sign in (1, -1) if top else ():
-        steady = sign * speed > 0.98 * top
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
-        stretches += list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-    return sorted(stretches)
+    fast = (np.ma.masked_where(~(sign * speed > 0.98 * top), speed) for sign in ((1, -1) if top else ()))
+    return sorted((part for one in fast for part in np.ma.clump_unmasked(one)), key=lambda part: int(part.start))
 
 
 def shown_episode(models: IdentifiedModels, unit: str | None, condition: str | None) -> EpisodeKey:

@@ -1,21 +1,19 @@
 """Estimates of the load torque."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from ...core.artifacts import load_artifact
+from ...core import load_artifact
 from ...evaluate.errors import error_spectrum
-from ..canvas import Figure, frequency_axis, grid, legend, logarithmic
+from ..canvas import Captioned, frequency_axis, grid, legend, logarithmic, set_titles
 from ..names import in_condition, model_label, model_look
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING
-from .episodes import TRUTH, draw_lines, hide_times
+from .episodes import TRUTH, draw_line, hide_times
 
 _WAYS = (("load", "load state"), ("current", "error of the\nrecorded current"))
 
 
-def load_torque(run: RunFolder) -> tuple[Figure, str]:
+def load_torque(run: RunFolder) -> Captioned:
     """Draw estimates of the load over an episode and spectra of their errors, a row a way to estimate."""
     if not run.has("load/load.json"):
         raise NotShownError("this study declares no load; set load.moment")
@@ -27,20 +25,19 @@ def load_torque(run: RunFolder) -> tuple[Figure, str]:
     figure, axes = grid(len(ways), 2, width_ratios=(3, 2), sharex="col")
     freqs, density = error_spectrum(truth, run.sample_period_s, 4 * DRAWING.segment)
     for (label, names), (time, spectrum) in zip(ways, axes, strict=True):
-        draw_lines(time, times, {"declared load": (truth, TRUTH)})
+        draw_line(time, times, truth, TRUTH, "declared load")
         spectrum.plot(freqs[1:], density[1:], color=TRUTH.colour, alpha=TRUTH.opacity, lw=TRUTH.weight)
         for name in reversed(names):
             model, values = name.partition("/")[0], arrays[f"estimate/{name}"].astype(float)
             look = model_look(model)
-            draw_lines(time, times, {model_label(model): (values, look)})
+            draw_line(time, times, values, look, model_label(model))
             error = error_spectrum(values - truth, run.sample_period_s, 4 * DRAWING.segment)[1]
             spectrum.plot(freqs[1:], error[1:], color=look.colour)
         time.set_ylabel(label)
         logarithmic(spectrum)
         frequency_axis(spectrum, freqs, "")
     hide_times(axes[:-1].ravel())
-    axes[0, 0].set_title("in units of current")
-    axes[0, 1].set_title("PSD of load and errors, 1/Hz")
+    set_titles(axes[0], ("in units of current", "PSD of load and errors, 1/Hz"))
     axes[-1, 0].set_xlabel("time (s)")
     axes[-1, 1].set_xlabel("frequency (Hz)")
     legend(figure, axes[0, 0])

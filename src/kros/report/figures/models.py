@@ -1,15 +1,12 @@
 """Identified models: magnitude and phase, step responses of every unit, and correlations of one-step residuals."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ...data import EpisodeBatch
 from ...evaluate.validation import correlation
-from ...identify import ModelSet
-from ...identify.identified import IdentifiedModels
-from ...observer.residual import one_step_residual
-from ..canvas import Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units
+from ...identify import IdentifiedModels, ModelSet
+from ...observer import one_step_residual
+from ..canvas import Captioned, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, set_titles
 from ..names import model_label, model_look, readable_unit, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
@@ -17,7 +14,7 @@ from .entries import short
 from .episodes import label_rows, shown_episode
 
 
-def bode(run: RunFolder) -> tuple[Figure, str]:
+def bode(run: RunFolder) -> Captioned:
     """Draw the Koopman models, or the linear ones where there are no others."""
     models = run.models[run.kinds[0]]
     text = f"{len(models.unit_ids)} {model_label(models.name)} models, every signal over its largest value."
@@ -45,7 +42,7 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
         lines = values[j % 2][:, :, i, j // 2]
         lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
         if nominal in models.unit_ids:
-            panel.plot(freqs, lines[models.index(nominal)], color=Tone.INK.light, label=f"nominal, unit {nominal}")
+            panel.plot(freqs, lines[models.index(nominal)], color=Tone.INK, label=f"nominal, unit {nominal}")
         frequency_axis(panel, freqs, "frequency (Hz)" if i == rows - 1 else "")
         panel.locator_params(axis="y", nbins=4)
         panel.set_ylabel("" if j else short(models.lifting.names[i]))
@@ -65,8 +62,7 @@ def step_figure(models: ModelSet) -> Figure:
         lines, colour = responses[..., i, j], model_look(models.name).colour
         lines_of_units(panel, time_s, lines, colour, f"{len(lines)} units", models.unit_ids)
         panel.margins(x=0)
-    for panel, name in zip(axes[0], inputs, strict=True):
-        panel.set_title(f"{short(name)}:\nstep of 1 {units.get(name, '')}")
+    set_titles(axes[0], (f"{short(name)}:\nstep of 1 {units.get(name, '')}" for name in inputs))
     label_rows(axes[:, 0], channels)
     label_below(axes[-1], "time (s)")
     legend(figure, axes[0, 0])
@@ -90,15 +86,12 @@ def residuals_figure(
     for values, name, panels in zip(residual.T, lifting.states, axes, strict=False):
         for other, panel in zip((values, *inputs), panels, strict=True):
             lines = correlation(values, other, DRAWING.lags)
-            panel.axhspan(
-                -band, band, color=Tone.GRID.light, lw=0, label=f"{100 * DRAWING.white:g} % band of white noise"
-            )
+            panel.axhspan(-band, band, color=Tone.GRID, lw=0, label=f"{100 * DRAWING.white:g} % band of white noise")
             panel.vlines(
                 np.arange(len(lines)), 0, lines, color=model_look(chosen.name).colour, label=model_label(chosen.name)
             )
         panels[0].set_ylabel(short(name))
-    for panel, name in zip(axes[0], ("itself", *chosen.recorded_inputs), strict=False):
-        panel.set_title(f"residual with\n{short(name)}")
+    set_titles(axes[0], (f"residual with\n{short(name)}" for name in ("itself", *chosen.recorded_inputs)))
     label_below(axes[-1], "lag (samples)")
     legend(figure, axes[0, 0])
     return figure

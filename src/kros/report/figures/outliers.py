@@ -1,20 +1,17 @@
 """Outlier scores of all units beside the threshold, with their range over all nominal units, a row a condition."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from ...data.population import natural_key
-from ...data.recording import some
+from ...data import natural_key, some
 from ...uncertainty import OutlierModel
-from ..canvas import Axes, Figure, grid, name_units, note, units_axis
+from ..canvas import Axes, Captioned, Figure, grid, name_units, note, units_axis
 from ..names import condition_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
 from ..unit_verdicts import Check
 
 
-def scores(run: RunFolder) -> tuple[Figure, str]:
+def scores(run: RunFolder) -> Captioned:
     """Draw one point a unit with its range, flagged ones in the colour of alarm, a column a condition."""
     models = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
     first = next(iter(models.values()))
@@ -45,13 +42,13 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
         ends = [score.lowest_db + shift, score.highest_db + shift]
-        axes.plot([place, place], ends, color=tone.light, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
-        (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone.light)
+        axes.plot([place, place], ends, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
+        (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone)
         name_units(point, [score.unit])
         if score.outlier or score is highest:
-            note(axes, score.unit, (place, score.score_db), (8, 0), xycoords="data", va="center", color=tone.light)
+            note(axes, score.unit, (place, score.score_db), (8, 0), xycoords="data", va="center", color=tone)
     if np.isfinite(model.threshold_db):
-        axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
+        axes.axhline(model.threshold_db, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
         text = f"threshold, {number(model.threshold_db)} dB"
         note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")
 
@@ -66,8 +63,8 @@ def check_figure(check: Check) -> Figure:
             scored = row["score"] is not None
             value, threshold = (row["score"], row["threshold"]) if scored else (row["level_db"], 0.0)
             ends = np.array([value, threshold], dtype=float)  # none is NaN
-            panel.plot(place, ends[0], "o", color=(Tone.ALARM if row["outlier"] else Tone.BLUE).light)
-            panel.plot([place - 0.4, place + 0.4], ends[[1, 1]], color=Tone.SOFT.light, ls="--")
+            panel.plot(place, ends[0], "o", color=Tone.ALARM if row["outlier"] else Tone.BLUE)
+            panel.plot([place - 0.4, place + 0.4], ends[[1, 1]], color=Tone.SOFT, ls="--")
         panel.set_title(condition_label(condition))
         units_axis(panel, [row["unit"] for row in rows])
     axes[0, 0].set_ylabel("score and threshold (dB)")

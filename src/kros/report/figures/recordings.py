@@ -1,24 +1,32 @@
 """Figures of the recordings: signals, the tracking error's spectrum, and the phase of every unit."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from ...core.arrays import AnyArray
-from ...core.errors import ConfigError
-from ...data.population import EpisodeKey, Population, Role
-from ...data.recording import some
+from ...core import AnyArray, ConfigError
+from ...data import EpisodeKey, Population, Role, some
 from ...evaluate.errors import error_spectrum
 from ...evaluate.validation import excitation
 from ...identify import PhaseCalibration
-from ..canvas import Figure, frequency_axis, grid, label_below, legend, logarithmic, name_units, note, units_axis
+from ..canvas import (
+    Captioned,
+    Figure,
+    frequency_axis,
+    grid,
+    label_below,
+    legend,
+    logarithmic,
+    name_units,
+    note,
+    set_titles,
+    units_axis,
+)
 from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, HUES, Tone
 from .entries import short
-from .episodes import draw_lines, hide_times, label_rows, references, steady_stretches
+from .episodes import draw_line, hide_times, label_rows, references, steady_stretches
 
-_RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light, weight=3, opacity=0.5)
+_RECORDED, _REFERENCE = Look(Tone.INK), Look(Tone.GOLD, weight=3, opacity=0.5)
 
 
 def recorded_episodes(run: RunFolder) -> list[Shown]:
@@ -27,7 +35,7 @@ def recorded_episodes(run: RunFolder) -> list[Shown]:
     return sorted(episodes, key=lambda s: s.key.condition != run.identify_on)
 
 
-def signals(run: RunFolder) -> tuple[Figure, str]:
+def signals(run: RunFolder) -> Captioned:
     """Draw one episode in at most two conditions, side by side, with references."""
     shown, channels, targets = recorded_episodes(run)[:2], run.states[: DRAWING.states], references(run.channels)
     figure, axes = grid(len(channels), len(shown), sharey="row", sharex="col")
@@ -35,8 +43,8 @@ def signals(run: RunFolder) -> tuple[Figure, str]:
         for i, channel in enumerate(channels):
             if channel.name in targets:
                 reference = episode.inputs[:, targets[channel.name]]
-                draw_lines(column[i], episode.time_s, {"reference": (reference, _REFERENCE)})
-            draw_lines(column[i], episode.time_s, {"recorded": (episode.states[:, i], _RECORDED)})
+                draw_line(column[i], episode.time_s, reference, _REFERENCE, "reference")
+            draw_line(column[i], episode.time_s, episode.states[:, i], _RECORDED, "recorded")
         column[0].set_title(episode_title(episode.key))
         hide_times(column[:-1])
     label_rows(axes[:, 0], channels)
@@ -61,7 +69,7 @@ def population_figure(population: Population, unit: str | None = None, condition
     figure, axes = grid(len(population.channels), 1, sharex=True)
     time_s = np.arange(len(values)) * population.sample_period_s
     for panel, channel, line in zip(axes[:, 0], population.channels, values.T, strict=True):
-        draw_lines(panel, time_s, {channel.name: (line, _RECORDED if channel.role is Role.STATE else _REFERENCE)})
+        draw_line(panel, time_s, line, _RECORDED if channel.role is Role.STATE else _REFERENCE, channel.name)
     label_rows(axes[:, 0], population.channels)
     axes[0, 0].set_title(episode_title(key))
     label_below(axes[-1], "time (s)")
@@ -77,34 +85,33 @@ def excitation_figure(population: Population, unit: str | None = None, condition
     freqs, power, coherence = excitation(population, keys, DRAWING.segment, DRAWING.averages)
     figure, axes = grid(len(inputs), 2, sharex=True)
     for i, (channel, (left, right)) in enumerate(zip(inputs, axes, strict=True), states):
-        left.plot(freqs[1:], power[i, 1:], color=Tone.GOLD.light)
+        left.plot(freqs[1:], power[i, 1:], color=Tone.GOLD)
         logarithmic(left)
         left.set_ylabel(f"{short(channel.name)}\n({squared(channel.unit)}/Hz)")
         for name, line, tone in zip(population.states, coherence[i], HUES, strict=False):
-            right.plot(freqs[1:], line[1:], color=tone.light, label=words(name))
+            right.plot(freqs[1:], line[1:], color=tone, label=words(name))
         right.set_ylim(0, 1.05)
         frequency_axis(left, freqs, "")
-    axes[0, 0].set_title(f"PSD, {len(keys)} episodes of unit {keys[0].unit}")
-    axes[0, 1].set_title("coherence with states")
+    set_titles(axes[0], (f"PSD, {len(keys)} episodes of unit {keys[0].unit}", "coherence with states"))
     label_below(axes[-1])
     legend(figure, axes[0, 1])
     return figure
 
 
-def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
+def tracking_spectrum(run: RunFolder) -> Captioned:
     """Draw the spectrum of the tracking error at constant speed in every condition (the paper's Figure 4)."""
     spec = run.calibration.spec
     figure, axes = grid(1, 1)
     panel, frequency = axes[0, 0], 0.0
     for shown, tone in zip(recorded_episodes(run), (Tone.BLUE, Tone.GOLD, Tone.GREEN), strict=False):
         freqs, density, frequency = _tracking(run, shown)
-        panel.plot(freqs[1:], density[1:], color=tone.light, label=episode_title(shown.key))
+        panel.plot(freqs[1:], density[1:], color=tone, label=episode_title(shown.key))
     logarithmic(panel)
     top = 0.5 / run.sample_period_s
     count = min(8, int(top / frequency))
     for multiple in range(1, count + 1):
         place = multiple * frequency
-        panel.axvline(place, color=Tone.SOFT.light, lw=DRAWING.thin, ls=":", zorder=1)
+        panel.axvline(place, color=Tone.SOFT, lw=DRAWING.thin, ls=":", zorder=1)
         note(panel, f"{place:.0f} Hz", (place, 1), (3, -2), xycoords=("data", "axes fraction"), va="top")
     panel.set_xlim(0, min(top, (count + 0.5) * frequency))
     panel.set_xlabel("frequency (Hz)")
@@ -121,7 +128,7 @@ def _tracking(run: RunFolder, shown: Shown) -> tuple[AnyArray, AnyArray, float]:
     values = np.hstack([shown.states, shown.inputs]).astype(float)
     reference, measured = values[:, names.index(spec.reference)], values[:, names.index(spec.measured)]
     settle = round(spec.settle * len(reference))
-    stretches = [slice(a + settle, b) for a, b in steady_stretches(reference)]
+    stretches = [slice(s.start + settle, s.stop) for s in steady_stretches(reference)]
     segment = min(DRAWING.segment, max((s.stop - s.start for s in stretches), default=0))
     if segment < 100:
         raise NotShownError(f"{shown.key} has no stretch of constant speed that is long enough")
@@ -131,7 +138,7 @@ def _tracking(run: RunFolder, shown: Shown) -> tuple[AnyArray, AnyArray, float]:
     return spectra[0][0], density, spec.ratio * float(np.abs(reference).max()) / (2 * np.pi)
 
 
-def phase(run: RunFolder) -> tuple[Figure, str]:
+def phase(run: RunFolder) -> Captioned:
     """Draw the phase calibration of a run (Appendix B)."""
     calibration = run.calibration
     lags = np.degrees([c.lag_rad for u, c in calibration.units.items() if u not in run.set_aside])
@@ -155,11 +162,11 @@ def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = No
     places, inside = np.arange(len(units)), np.array([u not in (set_aside or []) for u in units])
     for (column, label), panel in zip(columns, axes[0], strict=True):
         for chosen, look in ((inside, {}), (~inside, {"mfc": "none"})):
-            (drawn,) = panel.plot(places[chosen], column[chosen], "o", ms=4, color=Tone.BLUE.light, **look)
+            (drawn,) = panel.plot(places[chosen], column[chosen], "o", ms=4, color=Tone.BLUE, **look)
             name_units(drawn, [u for u, mark in zip(units, chosen, strict=True) if mark])
         panel.set_title(label)
         units_axis(panel, units)
     axes[0, 0].set_yticks([0, 180, 360])
-    axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
-    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
+    axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT, lw=DRAWING.thin, ls="--")
+    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
     return figure

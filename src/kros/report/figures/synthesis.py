@@ -1,25 +1,23 @@
 """Correction filters beside plant and weights."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from ...core.lti import StateSpace
+from ...core import AnyArray, StateSpace
 from ...design.task import split_name
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis
-from ..canvas import Axes, Figure, decibel, frequency_axis, grid, legend
+from ..canvas import Captioned, decibel, frequency_axis, grid, legend
 from ..names import label_of, method_look, model_label
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone
 
-Curve = tuple[str, np.ndarray, str, str]
+Curve = tuple[str, AnyArray, str, str]
 
 
-def bode(run: RunFolder) -> tuple[Figure, str]:
-    """Draw plant, weights and filters, linear beside Koopman (the paper's Figure 10)."""
+def bode(run: RunFolder) -> Captioned:
+    """Draw largest singular values of plant, weights and filters, linear beside Koopman (the paper's Figure 10)."""
     designed = {n: s for n, s in run.syntheses.items() if not label_of(n).baseline}
     robust = {n: s for n, s in designed.items() if split_name(n)[1] != "estimator"}  # which corrects no model
     chosen = [m for m in run.models if any(n.startswith(f"{m}/") for n in robust)]
@@ -27,38 +25,32 @@ def bode(run: RunFolder) -> tuple[Figure, str]:
         raise NotShownError("no robust observer has been synthesized")
     figure, axes = grid(1, len(chosen), sharey=True)
     for panel, name in zip(axes[0], chosen, strict=True):
+        freqs = run.models[name].frequencies(DRAWING.frequencies, decades=DRAWING.decades)
         syntheses = {n: s for n, s in robust.items() if n.startswith(f"{name}/")}
-        _panel(panel, _curves(run, name, syntheses), run.models[name])
+        for label, response, colour, line in _curves(run, name, syntheses, freqs):
+            size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
+            if np.isfinite(size).any():  # not of a filter that is zero
+                panel.plot(freqs, size, line, color=colour, label=label)
+        panel.axhline(0, color=Tone.SOFT, lw=DRAWING.thin)
+        frequency_axis(panel, freqs)
         panel.set_title(model_label(name))
     legend(figure, max(axes[0], key=lambda panel: len(panel.lines)), 4)
     axes[0, 0].set_ylabel("largest singular value (dB)")
     return figure, "Every signal over its largest value. K maps the innovation to the correction."
 
 
-def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis]) -> list[Curve]:
+def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis], freqs: AnyArray) -> list[Curve]:
     """Return responses with their label, colour and style."""
     models = run.models[name]
-    freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
-    curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY.light, "-")]
+    curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY, "-")]
     if name in run.uncertain:
         weight = run.uncertain[name].weight
-        curves.append(("W left", weight.left.frequency_response(freqs), Tone.GOLD.light, "-"))
-        curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN.light, "--"))
+        curves.append(("W left", weight.left.frequency_response(freqs), Tone.GOLD, "-"))
+        curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN, "--"))
     for observer, synthesis in syntheses.items():
         response, look = scaled_filter(synthesis, models).frequency_response(freqs), method_look(observer)
         curves.append((f"K {label_of(observer).text}", response, look.colour, look.style))
     return curves
-
-
-def _panel(axes: Axes, curves: Sequence[Curve], models: ModelSet) -> None:
-    """Draw largest singular values, of filters that are zero none."""
-    freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
-    for label, response, colour, line in curves:
-        size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
-        if np.isfinite(size).any():
-            axes.plot(freqs, size, line, color=colour, label=label)
-    axes.axhline(0, color=Tone.SOFT.light, lw=DRAWING.thin)
-    frequency_axis(axes, freqs)
 
 
 def scaled_filter(synthesis: Synthesis, models: ModelSet) -> StateSpace:

@@ -1,12 +1,10 @@
 """Figures of residuals and weights: six forms, weights over the optimal bound, entries of single units."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...core.arrays import AnyArray
+from ...core import AnyArray
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, residual, sigma_max
 from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
@@ -14,6 +12,7 @@ from ...uncertainty.unit_residuals import UnitResiduals
 from ...uncertainty.weights.cover import Cover
 from ..canvas import (
     Axes,
+    Captioned,
     Figure,
     decibel,
     frequency_axis,
@@ -23,6 +22,7 @@ from ..canvas import (
     line_over_shade,
     lines_of_units,
     note,
+    set_titles,
 )
 from ..names import model_label, number, words
 from ..run_folder import RunFolder
@@ -41,7 +41,7 @@ _PUBLISHED = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  #
 _INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 
 
-def forms(run: RunFolder) -> tuple[Figure, str]:
+def forms(run: RunFolder) -> Captioned:
     """Draw the largest residuals in all forms, linear beside Koopman (the paper's Figure 7)."""
     chosen = run.uncertain
     tall = {n: m for n, m in chosen.items() if n in run.models and len(m.output_scale) > len(m.input_scale)}
@@ -53,7 +53,7 @@ def forms(run: RunFolder) -> tuple[Figure, str]:
     for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
         draw_forms(panel, model)
         for form, (freqs, bound) in published.get(name, {}).items():
-            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light)
+            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form])
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
     legend(figure, axes[0, 0], 3)
@@ -75,12 +75,12 @@ def draw_forms(axes: Axes, model: UncertainModel) -> None:
     for form, bound in model.bounds.items():
         width, label = DRAWING.broad if form is model.form else None, words(form.value)
         style = ":" if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else "-"  # it often hides output multiplicative
-        axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form].light, lw=width, label=label)
-    axes.axhline(0, color=Tone.SOFT.light, lw=DRAWING.thin)
+        axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form], lw=width, label=label)
+    axes.axhline(0, color=Tone.SOFT, lw=DRAWING.thin)
     frequency_axis(axes, model.freqs_hz)
 
 
-def weights(run: RunFolder) -> tuple[Figure, str]:
+def weights(run: RunFolder) -> Captioned:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
     rows = {n: (run.uncertain[n], run.models[n], residuals) for n, residuals in run.unit_residuals.items()}
     parts = [f"{model_label(n)} {number(model.overbound_db_max)} dB" for n, (model, _, _) in rows.items()]
@@ -97,8 +97,7 @@ def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResidu
         _draw_weights(row, model, models.inputs if model.form in _INPUT_SIDE else ())
         ratio_panel(row[2], residuals)
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
-    for panel, title in zip(axes[0], ("left weight", "right weight", "units relative to the weights"), strict=True):
-        panel.set_title(title)
+    set_titles(axes[0], ("left weight", "right weight", "units relative to the weights"))
     label_below(axes[-1])
     return figure
 
@@ -109,8 +108,7 @@ def uncertain_figure(model: UncertainModel) -> Figure:
     _draw_weights(axes[0], model)
     draw_forms(axes[0, 2], model)
     legend(figure, axes[0, 2], 3)
-    for panel, title in zip(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"), strict=True):
-        panel.set_title(title)
+    set_titles(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"))
     label_below(axes[0])
     return figure
 
@@ -136,8 +134,8 @@ def _side(axes: Axes, freqs_hz: AnyArray, magnitudes: AnyArray, cover: AnyArray,
     columns = range(magnitudes.shape[1])
     labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
     for i, tone in zip(columns, HUES, strict=False):
-        line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone.light)
-        note(axes, words(labels[i]), (0, 1), (4, -10 * i - 1), va="top", color=tone.light)
+        line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone)
+        note(axes, words(labels[i]), (0, 1), (4, -10 * i - 1), va="top", color=tone)
     frequency_axis(axes, freqs_hz, "")
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
     axes.set_ylim(low, high + (high - low) * len(columns) / 4)
@@ -148,15 +146,15 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     rows, freqs = differing(residuals), residuals.freqs_hz
     levels = decibel(residuals.ratio)[rows]
     names = [residuals.unit_ids[k] for k in rows]
-    lines_of_units(axes, freqs, levels, Tone.BLUE.light, "units", names)
+    lines_of_units(axes, freqs, levels, Tone.BLUE, "units", names)
     first = int(np.nanargmax(np.nanmax(np.where(np.isfinite(levels), levels, -np.inf), axis=1)))
-    axes.plot(freqs, levels[first], color=Tone.INK.light)
-    note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK.light)
-    axes.axhline(0, color=Tone.ALARM.light, lw=DRAWING.thin, ls="--")
+    axes.plot(freqs, levels[first], color=Tone.INK)
+    note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK)
+    axes.axhline(0, color=Tone.ALARM, lw=DRAWING.thin, ls="--")
     frequency_axis(axes, freqs, "")
 
 
-def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
+def weights_entrywise(run: RunFolder) -> Captioned:
     """Draw residuals entry by entry with their fitted weights (the paper's Figure 8 as published)."""
     chosen = run.unit_residuals
     names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
@@ -168,7 +166,7 @@ def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
     return entries_figure(chosen, names), text
 
 
-def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
+def outlier_residuals(run: RunFolder) -> Captioned:
     """Draw the residual of the highest-scoring unit beside those of the others (the paper's Figure 15)."""
     first = next(iter(run.others.values()))
     unit = first.outside[0]

@@ -1,7 +1,5 @@
 """Sections of the report, from ``metrics.json`` alone: first what decides, then the evidence, which is folded."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from ..content import Section
@@ -12,9 +10,6 @@ from .errors import errors, left_out, other_conditions
 from .evidence import calibration, models, recordings, run, spread, uncertainty
 from .units import units
 
-Maker = Callable[[Facts], Section | None]
-FIRST: tuple[Maker, ...] = (deployment, errors, units)
-EVIDENCE: tuple[Maker, ...] = (
-    *(recordings, calibration, models, spread, uncertainty),
-    *(certificates, left_out, other_conditions, run),
-)
+Makers = tuple[Callable[[Facts], Section | None], ...]
+FIRST: Makers = (deployment, errors, units)
+EVIDENCE: Makers = (recordings, calibration, models, spread, uncertainty, certificates, left_out, other_conditions, run)

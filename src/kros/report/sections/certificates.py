@@ -73,7 +73,7 @@ def _table(facts: Facts) -> Table | None:
 
 def _reasons(entries: Mapping[str, Mapping[str, Any]]) -> Table | None:
     """Return why an observer could not be designed or certified; observers with the same reason share a row."""
-    reasons: dict[tuple[str, str], list[str]] = {}
+    reasons = dict[tuple[str, str], list[str]]()
     for name, entry in entries.items():
         first = "not designed" if entry.get("status") == "failed" else "set of plants"
         for kind, key in ((first, "reason"), ("recorded signals", "set_reason"), ("at run time", "relift_reason")):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
+from ...core import ByName
 from ..content import Column, Section, Table, build
 from ..facts import Facts
 from ..names import axis_label, joined, label_of, number, words
@@ -40,7 +40,7 @@ def deployment(facts: Facts) -> Section | None:
     return Section("deployment", "Deployment", texts, [(term, of) for term, of in card if of], [table])
 
 
-def _needed(facts: Facts, entry: Mapping[str, Any]) -> Table | None:
+def _needed(facts: Facts, entry: ByName) -> Table | None:
     """Return the errors of measurements that cost one percent in each estimate; None where no gain is known."""
     rows = [(c, kind, of) for c, kinds in entry.get("sensor_gains", {}).items() for kind, of in kinds.items()]
     columns = [Column("error", [f"{axis_label(c, facts.unit(c))}: {_ERRORS[kind]}" for c, kind, _ in rows])]
@@ -50,7 +50,7 @@ def _needed(facts: Facts, entry: Mapping[str, Any]) -> Table | None:
     return build("Error of a measurement that costs 1 % of the largest value of an estimate", columns)
 
 
-def _interface(facts: Facts, entry: Mapping[str, Any]) -> list[tuple[str, Sequence[str]]]:
+def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
     """Return signals, rate, delay, parameters and sensor."""
     largest, dt, late = entry["largest"], facts.study["sample_period_s"], entry["delay_samples"]
 
@@ -81,7 +81,7 @@ def _parameters(parameters: Mapping[str, float | None], calibrated: bool) -> lis
     return [f"{values}; every unit has its own value: --parameter UNIT.{first}=VALUE{how}."]
 
 
-def _next_unit(entry: Mapping[str, Any] | None) -> list[str]:
+def _next_unit(entry: ByName | None) -> list[str]:
     """Return the bound for the next unit from units in reserve."""
     if not entry:
         return []
@@ -93,7 +93,7 @@ def _next_unit(entry: Mapping[str, Any] | None) -> list[str]:
     return [f"Its errors are at most {text} with {level} confidence ({entry['reserve']} units in reserve)."]
 
 
-def _monitor(entry: Mapping[str, Any] | None) -> list[str]:
+def _monitor(entry: ByName | None) -> list[str]:
     """Say what status bit 8 means, and how often it is wrong."""
     if not entry:
         return []

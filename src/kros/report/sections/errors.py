@@ -66,14 +66,12 @@ def left_out(facts: Facts) -> Section | None:
         parts = {"made": ("designed", ""), "robust": ("set of plants", "certified")}
         parts["relift_certified"] = ("at run time", "certified")
         about = [Column("observer", [observer_label(name) for name in table.cells])]
-        about += [Column(title, [_count(e.get(key), folds) for e in entries], g) for key, (title, g) in parts.items()]
+        for key, (title, group) in parts.items():
+            counts = [None if e.get(key) is None else f"{e[key]}/{folds}" for e in entries]
+            about.append(Column(title, counts, group))
         caption = f"Units left out{in_condition(table.condition)}"
         tables.append(_table(caption, about, [(table, name) for name in table.cells], facts, sortable=True))
     return Section("left-out", "Units left out", [text, *failed], tables=tables)
-
-
-def _count(value: int | None, folds: int) -> str | None:
-    return None if value is None else f"{value}/{folds}"
 
 
 def _table(caption: str, about: Sequence[Column], rows: Rows, facts: Facts, **options: bool) -> Table | None:
@@ -112,11 +110,12 @@ def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
         return min(names, key=lambda name: table.mean(name, channels), default=None)
 
     chosen = [
-        *(("deployed", facts.deployed), ("best with a certificate", best(certified))),
+        ("deployed", facts.deployed),
+        ("best with a certificate", best(certified)),
         ("as published", next(iter(published(table.cells)), None)),
         *(("", name) for name in (best(tuned), "learned", "filtered_difference", f"{facts.model}/open_loop")),
     ]
-    roles: dict[str, list[str]] = {}
+    roles = dict[str, list[str]]()
     for role, name in chosen:
         if name in table.cells:
             roles.setdefault(str(name), []).extend([role] if role else [])

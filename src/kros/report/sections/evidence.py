@@ -7,7 +7,7 @@ import platform
 from importlib import import_module
 
 from ...core.linalg import radius_text
-from ...data.recording import some
+from ...data import some
 from ..content import Column, Section, build
 from ..facts import Facts
 from ..names import in_condition, minus, model_label, number, words

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
+from ...core import ByName
 from ..content import Column, Section, build
 from ..facts import Facts
 from ..names import in_condition, number, words
 from ..theme import DRAWING
 
-Row = Mapping[str, Any]
+_ERRORS = {"error (%)": "error_percent", "against the true signal (%)": "true_error_percent"}
+_OF_SCORES = {"score (dB)": "score", "detectable change of gain (%)": "detectable"}
 _SCORES = (
     "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. A "
     "unit above the threshold is flagged. A defect that changes every gain by less than the detectable change is not."
@@ -35,8 +36,8 @@ def units(facts: Facts) -> Section | None:
     columns = [
         Column("unit", names),
         Column("status", [_status(row, [r for r in rows if r["unit"] == row["unit"]]) for row in shown]),
-        *_errors(names, errors),
-        *_scores(names, scores),
+        *_columns(names, errors, _ERRORS, words),
+        *_columns(names, scores, _OF_SCORES, lambda condition: f"outlier test{in_condition(condition)}"),
         Column("phase (°)", [None if p is None else math.degrees(p) for p in phases]),
     ]
     order = f"units{in_condition(home)}, flagged ones and largest errors first"
@@ -47,9 +48,9 @@ def units(facts: Facts) -> Section | None:
     return Section("units", "Units", [" ".join(text)], tables=[table], figure="outlier_scores" if rows else "")
 
 
-def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: set[str]) -> list[Row]:
+def _first(rows: Sequence[ByName], errors: Mapping[tuple[str, str], ByName], flagged: set[str]) -> list[ByName]:
     """Return flagged units, then those with the largest errors; of very many units the first ones."""
-    largest: dict[str, float] = {}
+    largest = dict[str, float]()
     for (unit, _), row in errors.items():
         error = math.inf if row["error_percent"] is None else row["error_percent"]
         largest[unit] = max(largest.get(unit, 0.0), error)
@@ -57,27 +58,18 @@ def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: 
     return ordered[: DRAWING.units]
 
 
-def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], Row]) -> list[Column]:
-    """Return the errors of every hidden channel."""
-    keys = {"error (%)": "error_percent", "against the true signal (%)": "true_error_percent"}
+def _columns(
+    names: Sequence[str], rows: Mapping[tuple[str, str], ByName], keys: Mapping[str, str], group: Callable[[str], str]
+) -> list[Column]:
+    """Return columns of what rows by unit, and by channel or condition, hold."""
     return [
-        Column(title, [errors.get((unit, channel), {}).get(key) for unit in names], words(channel))
-        for channel in dict.fromkeys(c for _, c in errors)
+        Column(title, [rows.get((unit, place), {}).get(key) for unit in names], group(place))
+        for place in dict.fromkeys(place for _, place in rows)
         for title, key in keys.items()
     ]
 
 
-def _scores(names: Sequence[str], scores: Mapping[tuple[str, str], Row]) -> list[Column]:
-    """Return scores and detectable changes in every condition."""
-    keys = {"score (dB)": "score", "detectable change of gain (%)": "detectable"}
-    return [
-        Column(title, [scores.get((u, c), {}).get(k) for u in names], f"outlier test{in_condition(c)}")
-        for c in dict.fromkeys(c for _, c in scores)
-        for title, k in keys.items()
-    ]
-
-
-def _status(row: Row, scores: Sequence[Row]) -> str:
+def _status(row: ByName, scores: Sequence[ByName]) -> str:
     """Return one word a unit."""
     if any(r["outlier"] for r in scores):
         return "flagged"
@@ -86,7 +78,7 @@ def _status(row: Row, scores: Sequence[Row]) -> str:
     return "undecided" if silent and status == "ok" else status
 
 
-def _flagged(row: Row) -> str:
+def _flagged(row: ByName) -> str:
     """Say where and how clearly a flagged unit differs."""
     text = f"Unit {row['unit']}{in_condition(row['condition'])}: score {number(row['score'])} dB"
     text += f", most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""

@@ -1,28 +1,20 @@
 """`kros check`: scores of new units against a finished study, the level of the innovation on them, and the verdicts."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from ...core.arrays import Array, Flags
-from ...core.artifacts import plain
-from ...core.errors import ConfigError, DataError
-from ...core.work import Executor
+from ...core import Array, ConfigError, DataError, Executor, Flags, Record, plain
 from ...data import Population
 from ...data.recording import check_population
 from ...identify import ModelSet
 from ...identify.calibration import training_keys, unit_parameters
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
-from ...observer import Observer
-from ...observer.screen import screened
-from ...observer.simulate import run_innovations
+from ...observer import Observer, run_innovations, screened
 from ...report.unit_verdicts import Rows, with_verdict
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import Evidence, Recorded, score_row
@@ -76,14 +68,18 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_uni
             return watched
         check_channels(population, observer)
     if not names:
-        advice = "run the study until quantify, with at least three units"
-        raise ConfigError(f"Run {store.folder}: has no outlier scores to compare with; {advice}.")
+        raise ConfigError(
+            f"Run {store.folder}: has no outlier scores to compare with; run the study until quantify, with at least "
+            "three units."
+        )
     sets = {name: ModelSet.load(store.path("models", name)) for name in names}
     known = {name: models for name, models in sets.items() if models.condition in population.conditions}
     if not known:
         modelled, there = (", ".join(c) for c in ([m.condition for m in sets.values()], population.conditions))
-        both = f"the recordings have the conditions {there}, and the run has models of {modelled} alone"
-        raise DataError(f"Checking {data}: {both}; name the condition, as in the study.")
+        raise DataError(
+            f"Checking {data}: the recordings have the conditions {there}, and the run has models of {modelled} alone; "
+            "name the condition, as in the study."
+        )
     levels = {(r["unit"], r["condition"]): {k: r[k] for k in r if k.startswith("level_")} for r in watched}
     rows: Rows = []
     with open_executor(workers) as executor:
@@ -144,7 +140,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
         if monitor is not None and any(good.any() for _, good in judged):
             level = float(monitor.level(np.concatenate(monitor.in_turn(judged))).max())
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
-        row: dict[str, Any] = dict.fromkeys(("score", "threshold", "detectable"))
+        row: Record = dict.fromkeys(("score", "threshold", "detectable"))
         row |= {"unit": unit, "condition": condition, "outlier": outlier, "episodes": len(keys), "left_out": []}
         row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "missing": missing, "level_db": level}
         row |= {"level_rate": monitor and monitor.false_alarm_rate, "level_units": monitor and monitor.units}

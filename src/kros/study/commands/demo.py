@@ -1,15 +1,10 @@
 """Simulated recordings on disk, and the whole study on them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from ...core.artifacts import digest_of, write_json
-from ...core.errors import ConfigError
-from ...core.work import Progress
+from ...core import ConfigError, Progress, digest_of, frozen, write_json
 from ...data import write_parquet
 from ...data.readers.motor_drive_raw import write_raw
 from ...identify.presets import HARMONIC_DRIVE
@@ -21,7 +16,7 @@ from ..pipeline import RunResult, require_usable, run_in
 _STAGE, _RECORDINGS = "simulate", "simulated"
 
 
-@dataclass(frozen=True)
+@frozen
 class Simulation:
     """A population to simulate, and the format of its recordings."""
 
@@ -46,8 +41,8 @@ def simulate_to(out: Path, simulation: Simulation) -> None:
         raise ConfigError(f"--format raw: is the layout of motor drives; write {plant} as parquet.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"Output {out}: exists and is not an empty folder; name a new one.")
-    names = ("n_units", "n_episodes", "seconds", "seed", "outlier")
-    simulated = PLANTS[plant](**{name: getattr(simulation, name) for name in names}).simulate()
+    settings = {key: value for key, value in vars(simulation).items() if key not in ("plant", "format")}
+    simulated = PLANTS[plant](**settings).simulate()
     if out.exists():
         out.rmdir()
     if raw:

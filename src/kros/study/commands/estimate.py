@@ -1,31 +1,21 @@
 """`kros estimate`: estimates beside what was recorded, with time, status and error band, in the recordings' units."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ...core.artifacts import load_artifact
-from ...core.errors import ConfigError
-from ...core.files import write_bytes
+from ...core import ConfigError, Record, load_artifact, write_bytes
 from ...export.estimates import ENDINGS, writer
-from ...observer.units import recorded_channel, recorded_factors
+from ...observer import recorded_channel, recorded_factors
 from ..config import Stage
 from ..engine.store import open_finished
 from .field import FieldRecordings, status_counts
 
 
 def estimate_recordings(
-    run: Path,
-    data: Path,
-    out: Path,
-    given: Collection[str] = (),
-    track: str | None = None,
-    plot: Path | None = None,
+    run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None, plot: Path | None = None
 ) -> list[str]:
     """Write what `facts_of` names for every sample, and a plot of the first episode; return what people read.
 
@@ -70,7 +60,7 @@ def unit_lines(sources: Mapping[str, str], counts: Mapping[str, Mapping[str, int
     return lines
 
 
-def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
+def facts_of(recordings: FieldRecordings) -> Record:
     """Return the observer, columns with their units of measure, and parameters of every unit with their sources."""
     observer, name = recordings.observer, recordings.name
     columns = {c.name: recorded_channel(observer, c.name).unit for c in recordings.population.channels}

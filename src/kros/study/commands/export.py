@@ -1,22 +1,18 @@
 """A run's observer as C99 source, or as a functional mock-up unit."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 
 import numpy as np
 
-from ...core.artifacts import write_json
-from ...core.errors import ConfigError, KrosError
+from ...core import ConfigError, KrosError, write_json
 from ...data import EpisodeBatch
 from ...data.discovery.roles import identifier
 from ...evaluate.held_out import as_arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
 from ...identify.survey import RecordingFacts
 from ...loops.compiler import find_compiler
-from ...observer import Observer, run_observer
-from ...observer.units import recorded_factors
+from ...observer import Observer, recorded_factors, run_observer
 from ..config import Stage, StudyConfig
 from ..engine.store import Store, open_finished
 from ..stages.learning import open_source

@@ -6,26 +6,32 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from ...core.arrays import Array, Bits
-from ...core.artifacts import load_artifact
-from ...core.errors import ConfigError, DataError, IdentificationError
-from ...core.files import did_you_mean, read_toml
-from ...core.rounding import AGREED
-from ...data import Population, read
-from ...data.population import EpisodeKey
+from ...core import (
+    AGREED,
+    Array,
+    Bits,
+    ConfigError,
+    DataError,
+    IdentificationError,
+    Names,
+    did_you_mean,
+    frozen,
+    load_artifact,
+    read_toml,
+)
+from ...data import EpisodeKey, Population, read
 from ...data.prepare import with_gaps
 from ...evaluate.held_out import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibration import Texts, Values, unit_values
 from ...identify.survey import RecordingFacts
-from ...observer import Observer
-from ...observer.screen import SampleStatus
+from ...observer import Observer, SampleStatus
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config
@@ -56,11 +62,12 @@ def open_data(config: StudyConfig, data: Path, optional: Collection[str]) -> Pop
     except (ConfigError, DataError) as error:
         if not data.is_dir() or data.suffix == ".toml":
             raise
-        other = "Recordings of another kind than the run's are named by a TOML with [data], as in a study."
-        raise type(error)(f"{error} {other}") from error
+        raise type(error)(
+            f"{error} Recordings of another kind than the run's are named by a TOML with [data], as in a study."
+        ) from error
 
 
-def hidden_states(observer: Observer) -> tuple[str, ...]:
+def hidden_states(observer: Observer) -> Names:
     """Return the recorded states that are not measured at run time."""
     return tuple(name for i, name in enumerate(observer.recorded) if i not in observer.measured)
 
@@ -71,20 +78,26 @@ def check_channels(population: Population, observer: Observer, *, hidden: bool =
     needed = (*observer.outputs, *observer.inputs)
     names = [*population.states, *population.inputs]
     if not hidden and (missing := [name for name in needed if name not in names]):
-        absent = f"{', '.join(missing)} is missing, which the observer reads; there are {', '.join(names)}"
-        raise DataError(f"Channels: {absent}; record it, or correct the mapping.")
+        raise DataError(
+            f"Channels: {', '.join(missing)} is missing, which the observer reads; there are {', '.join(names)}; "
+            "record it, or correct the mapping."
+        )
     if hidden and expected != there:
-        both = f"the run has states and inputs {expected}, the recordings {there}"
-        raise DataError(f"Channels: {both}; read them the same way.")
+        raise DataError(
+            f"Channels: the run has states and inputs {expected}, the recordings {there}; read them the same way."
+        )
     units = observer.about.get("units_of_measure", {})
     for channel in population.channels:
         if channel.unit and units.get(channel.name, channel.unit) not in ("", channel.unit):
-            both = f"is in {units[channel.name]!r} in the run and in {channel.unit!r} in the recordings"
-            advice = "declare a scale step, or leave the unit out where it is only written differently"
-            raise DataError(f"Channels: {channel.name} {both}; {advice}.")
+            raise DataError(
+                f"Channels: {channel.name} is in {units[channel.name]!r} in the run and in {channel.unit!r} in the "
+                "recordings; declare a scale step, or leave the unit out where it is only written differently."
+            )
     if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=AGREED):
-        both = f"the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s"
-        raise DataError(f"Sampling period: {both}; declare a resample step.")
+        raise DataError(
+            f"Sampling period: the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} "
+            "s; declare a resample step."
+        )
 
 
 def identify_on(store: Store) -> str:
@@ -100,8 +113,10 @@ def load_observer(store: Store, name: str = "deployed") -> Observer:
     known = {"deployed": DEPLOYED} | {one: ("observers", f"{one}.json") for one in names}
     known |= {f"{k}/{LOAD}": (LOAD, f"{k}.json") for k in ("koopman", "linear") if store.holds(LOAD, f"{k}.json")}
     if name not in known:
-        hint = f"{did_you_mean(name, known) or ';'} known are {', '.join(known)}"
-        raise ConfigError(f"Run {store.folder}: has no observer {name!r}{hint}.")
+        raise ConfigError(
+            f"Run {store.folder}: has no observer {name!r}{did_you_mean(name, known) or ';'} known are "
+            f"{', '.join(known)}."
+        )
     chosen = Observer.load(store.path(*known[name]))
     if chosen.about:
         return chosen
@@ -132,7 +147,7 @@ def parse_given(texts: Collection[str], units: Collection[str], known: Collectio
     return given
 
 
-@dataclass(frozen=True)
+@frozen
 class FieldRecordings:
     """Recordings that need no hidden channels, with all that the observer needs to run on them."""
 
@@ -164,8 +179,10 @@ class FieldRecordings:
             missing = [name for name in self.observer.lifting.parameters if name not in known]
             if set(missing) - {self.name}:
                 reason, first = reasons.get(unit, "it was not calibrated."), missing[0]
-                advice = f"Give it, --parameter {unit}.{first}=VALUE, or let it be followed, --track {first}."
-                raise IdentificationError(f"Parameter {', '.join(missing)} of unit {unit}: {reason} {advice}")
+                raise IdentificationError(
+                    f"Parameter {', '.join(missing)} of unit {unit}: {reason} Give it, --parameter "
+                    f"{unit}.{first}=VALUE, or let it be followed, --track {first}."
+                )
             if self.name is not None:
                 known[self.name] = self._start(unit, self.name) if missing else known[self.name]
                 start = "of the smallest innovation" if missing else f"that is {sources.get(unit)}"

@@ -1,28 +1,23 @@
 """`kros init`: look at a folder of recordings, write the study that runs on it, and say what looks wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from ...core.errors import ConfigError, DataError
-from ...core.work import Progress, Work
-from ...data import Population
+from ...core import ByName, ConfigError, DataError, Progress, Record, Work
+from ...data import Population, detect_reader
 from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.text import comment, key_lines, mapping_lines
-from ...data.readers.opening import detect_reader
 from ...data.recording import check_population
 from ...identify.survey import UNLOADED, survey
 from ..config import study_schema, validate_config
 from ..stages.learning import FEWEST, open_source
 
 
-def study_text(source: Path, data: Mapping[str, Any], discovery: Discovery | None, findings: Sequence[str]) -> str:
+def study_text(source: Path, data: ByName, discovery: Discovery | None, findings: Sequence[str]) -> str:
     """Return a study as TOML."""
     written = f"Written by kros init from the recordings in {source.name}. It can be run as it is; edit any line."
     lines = [f"#:schema ./{SCHEMA}", *comment(written)]
@@ -58,9 +53,11 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     reader, discovery = detect_reader(source), None
     if reader in ("parquet", "motor-drive-raw"):
         if wanted != Wanted():
-            says = f"these are {reader} recordings, which say what channels are"
-            raise ConfigError(f"Looking at {source}: {says}; leave out --measured, --input, --files and --period.")
-        data: dict[str, Any] = {"source": _source(source, out), "reader": reader}
+            raise ConfigError(
+                f"Looking at {source}: these are {reader} recordings, which say what channels are; leave out "
+                "--measured, --input, --files and --period."
+            )
+        data: Record = {"source": _source(source, out), "reader": reader}
     else:
         discovery = discover(source, wanted, work)
         data = {"source": _source(source, out), "reader": "csv", "csv": discovery.mapping}

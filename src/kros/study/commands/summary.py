@@ -1,17 +1,12 @@
 """A few lines for people at a terminal: about a run, and about what is installed."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
-from ...core.artifacts import load_artifact
-from ...core.errors import ConfigError
-from ...core.files import write_bytes
+from ...core import ConfigError, Record, load_artifact, write_bytes
 from ...loops.compiler import COMPILERS
 from ...report.compare import comparison, lines, sections
 from ...report.content import Column, Section, build
@@ -67,19 +62,19 @@ def ranking(facts: Facts) -> list[str]:
 def list_run(run: Path) -> list[str]:
     """Return what was studied, which stages are done, the observers in the order of their errors, and the verdict."""
     with open_finished(run) as (config, store):
-        records = {stage.value: store.record(stage) for stage in Stage}
-        done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]
+        manifest = store.manifest
+        done = [f"{stage} {manifest[stage].seconds:.3g} s" for stage in Stage if stage in manifest]
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
         if store.path(METRICS).exists():
             result = RunResult(store.folder, store.metrics())
             return lines + ranking(Facts(result.metrics)) + result.summary().splitlines()[1:]
-        if store.record(Stage.SYNTHESIZE) is not None:
+        if Stage.SYNTHESIZE in manifest:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]
             lines += [f"observers: {', '.join(names)}"]
         return [*lines, "the run has not ended; the same command of kros run goes on with it"]
 
 
-def compare_runs(runs: Sequence[Path], out: Path | None) -> tuple[dict[str, Any], list[str]]:
+def compare_runs(runs: Sequence[Path], out: Path | None) -> tuple[Record, list[str]]:
     """Return finished runs beside each other, as content of JSON and as lines; written as a page to `out`."""
     if len(set(runs)) < 2:
         raise ConfigError(f"Compare: at least two runs are needed, found {len(set(runs))}; name another run folder.")

@@ -4,16 +4,12 @@ The result file is named by the recording, its size and the time of its last cha
 What has one is done, all else is not, and nothing else is remembered. A recording at rest is the same in two looks.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-from ...core.artifacts import digest_of, write_json
-from ...core.errors import ConfigError, KrosError
+from ...core import ConfigError, KrosError, Record, digest_of, write_json
 from ...core.files import draft_beside, is_file, link_or_copy, stamp_of
 from ...data.readers.parquet import INDEX
 from ...report.unit_verdicts import worst
@@ -64,7 +60,7 @@ def place_of(path: Path, changing: Path, folder: Path, out: Path) -> Path:
 
 def judged(config: StudyConfig, store: Store, path: Path, place: Path, folder: Path, out: Path) -> Iterator[str]:
     """Check one recording, alone in a folder like its own, and write its result; yield its line, none if it changed."""
-    name, result = str(path.relative_to(folder)), dict[str, Any]()
+    name, result = str(path.relative_to(folder)), Record()
     with draft_beside(out) as draft:
         try:
             if path.is_file():

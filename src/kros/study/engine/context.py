@@ -1,32 +1,26 @@
 """What every stage gets, and the stages in order: each is run, or found done by the digest of what it follows from."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
-from ...core.artifacts import digest_of, load_artifact, write_json
-from ...core.files import stamp_of
+from ...core import Names, Record, digest_of, frozen, load_artifact, stamp_of, write_json
 from ...core.work import Results, Work
-from ...data.population import EpisodeKey, Population
-from ...data.recording import NonFiniteError
+from ...data import EpisodeKey, NonFiniteError, Population
 from ...data.recording import digest_of as episode_digest
 from ...identify import PhaseCalibration, PhaseSpec
 from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...identify.survey import RecordingFacts
 from ...lifting import Lifting
-from ...uncertainty.quantify import UncertainModels
+from ...uncertainty import UncertainModels
 from ..config import Stage, StudyConfig
 from .store import METRICS, STUDY, Store, code_key
 
 
-@dataclass(frozen=True)
+@frozen
 class Context:
     """What a stage gets: the study, its run folder, where work runs, and recordings and models that are given."""
 
@@ -76,12 +70,12 @@ class Context:
         return UncertainModels.load_sets(self.store.folder, self.identified)
 
     @cached_property
-    def observers_record(self) -> dict[str, Any]:
+    def observers_record(self) -> Record:
         """What the synthesize stage left beside its observers: names, facts, and which is deployed."""
         return load_artifact(self.store.path("observers"), "observers")[0]
 
     @cached_property
-    def evaluation(self) -> dict[str, Any]:
+    def evaluation(self) -> Record:
         """What the evaluate stage left: errors of observers and baselines."""
         return load_artifact(self.store.path("evaluation"), "evaluation")[0]
 
@@ -89,13 +83,13 @@ class Context:
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@frozen
 class StageStep:
     """One stage: what it does, the sections or ``section.key`` it follows from, and which studies have it."""
 
     stage: Stage
     run: Callable[[Context], None]
-    sections: tuple[str, ...]
+    sections: Names
     wanted: Callable[[StudyConfig], bool] = lambda config: True
 
 
@@ -144,19 +138,14 @@ def _outdate(context: Context, digests: Mapping[Stage, str]) -> None:
 def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, str]:
     """Return digests of what stages follow from: kros, the stages before, recordings, their part of the study."""
     tables, digest, digests = context.config.dump(), code_key(), dict[Stage, str]()
+    tables |= {f"{section}.{key}": v for section, of in tables.items() if isinstance(of, dict) for key, v in of.items()}
     digest_inputs = {Stage.READ: inputs_digest, Stage.CALIBRATE: models_digest}
     for step in steps:
         if step.wanted(context.config):
             inputs = digest_inputs[step.stage](context) if step.stage in digest_inputs else ""
-            digest = digest_of(digest, str(step.stage), inputs, [_part(tables, name) for name in step.sections])
+            digest = digest_of(digest, str(step.stage), inputs, [tables[name] for name in step.sections])
             digests[step.stage] = digest
     return digests
-
-
-def _part(tables: Mapping[str, Mapping[str, object]], name: str) -> object:
-    """Return a section of a study, or a ``section.key``."""
-    section, _, key = name.partition(".")
-    return tables[section][key] if key else tables[section]
 
 
 def inputs_digest(context: Context) -> str:
@@ -165,7 +154,7 @@ def inputs_digest(context: Context) -> str:
     if given is not None:
         declared = (given.columns, given.sample_period_s, given.units, sorted(given.metadata.items()))
         return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
-    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [Path(source)]
+    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
     return digest_of([(str(f), *stamp_of(f)) for f in files])
 
 

@@ -4,8 +4,6 @@ The order of the sums in a matrix product depends on the number of threads, so e
 hold one end of a pipe whose other end is this process's alone: they end when it is closed.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import socket
@@ -15,13 +13,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
 from threading import Lock
 from typing import Any, TypeVar
 
-from ...core.errors import ConfigError, KrosError, MissingDependencyError
-from ...core.work import Executor, Progress
+from ...core import ConfigError, Executor, KrosError, MissingDependencyError, Progress, frozen
 from .store import code_key
 
 
@@ -113,8 +109,10 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
         try:
             return [function(task) for task in tasks]
         except FileNotFoundError as error:
-            needed = "recordings and run folder must be in a shared folder, the same path on every worker"
-            raise KrosError(f"{worker}: finds no {error.filename}; {needed}.") from error
+            raise KrosError(
+                f"{worker}: finds no {error.filename}; recordings and run folder must be in a shared folder, the same "
+                "path on every worker."
+            ) from error
 
 
 @contextmanager
@@ -143,8 +141,9 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
         get_address_host_port(address)  # a client made with something else goes on trying
         client = Client(address, set_as_default=False)
     except (OSError, ValueError) as error:
-        problem = f"no Dask scheduler of this version answers there ({error})"
-        raise ConfigError(f"--scheduler {address}: {problem}; correct the address.") from error
+        raise ConfigError(
+            f"--scheduler {address}: no Dask scheduler of this version answers there ({error}); correct the address."
+        ) from error
     if not client.nthreads():
         log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)
     messages = logging.getLogger("distributed.client")
@@ -160,7 +159,7 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
 _CHUNKS = 100  # of a map of many tasks, which are small: handing each out costs the parent a tenth of the work
 
 
-@dataclass(frozen=True)
+@frozen
 class ProcessExecutor(Executor):
     """Runs tasks in worker processes, each with a single BLAS thread."""
 

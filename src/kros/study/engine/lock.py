@@ -1,7 +1,5 @@
 """Run folders are locked while they are used."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os
@@ -10,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ...core.errors import ConfigError
+from ...core import ConfigError
 
 try:
     import fcntl

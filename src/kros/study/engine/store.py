@@ -15,14 +15,13 @@ import logging
 import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
+from ...core import ConfigError, DataError, DimensionError, Record, frozen
 from ...core.artifacts import digest_of, file_digest, read_json, with_checksum, write_json
-from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy
 from ...report.manifest import INDEX, MANIFEST, Artefact, describe, place, read_manifest, recorded_files, write_manifest
 from ..config import Stage, StudyConfig, stored_config
@@ -35,7 +34,7 @@ STORE = "store"
 STUDY, METRICS = "study.json", "metrics.json"  # of a run, and of no stage
 
 
-@dataclass(frozen=True)
+@frozen
 class Store:
     """A run folder; `place` is the draft of the stage that runs, `shared` the store of the run around this one."""
 
@@ -82,7 +81,7 @@ class Store:
         name = "/".join(parts)
         return any(f == name or f.startswith(f"{name}/") for f in self.files())
 
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> Record:
         """Return the metrics of the run."""
         content = read_json(self.path(METRICS))
         if not isinstance(content, dict) or not {"study", "units"} <= set(content):
@@ -146,8 +145,10 @@ class Store:
             link_or_copy(source, beside)
             beside.replace(target)
         except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            obstacle = f"{error.filename2 or error.filename} is in the place of a result"
-            raise ConfigError(f"Run folder {self.folder}: {obstacle}; move it away.") from error
+            raise ConfigError(
+                f"Run folder {self.folder}: {error.filename2 or error.filename} is in the place of a result; move it "
+                "away."
+            ) from error
 
     def drop(self, *stages: str) -> None:
         """Forget stages and their files in the run folder that are as written; artefacts stay."""
@@ -177,15 +178,11 @@ class Store:
                 _remove(path)
 
     def sweep(self) -> None:
-        """Remove what the run does not use any more from its store."""
-        _sweep(self.artefacts, self._named())
-
-    def _named(self) -> set[str]:
-        """Digests of all artefacts of this run and of those inside, and of results that they were computed from."""
+        """Remove from the store what neither this run nor one inside, or an artefact of theirs, follows from."""
         inside = [replace(self, folder=path.parent) for path in self.folder.glob(f"*/*/{MANIFEST}")]
         digests = {artefact.digest for run in (self, *inside) for artefact in run.manifest.values()}
         stored = [artefact for artefact in map(self.stored, digests) if artefact is not None]
-        return {digest for artefact in stored for digest in (artefact.digest, *artefact.results)}
+        _sweep(self.artefacts, {digest for artefact in stored for digest in (artefact.digest, *artefact.results)})
 
 
 def _sweep(folder: Path, named: Collection[str]) -> None:
@@ -230,18 +227,20 @@ def require_own(out: Path, config: StudyConfig) -> bool:
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
     there, this = _identity(_read_study(out)), _identity(config.dump())
     if there != this:
-        both = f"holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}"
-        raise ConfigError(f"Output {out}: {both}; name another folder, or remove this one if it is not needed.")
+        raise ConfigError(
+            f"Output {out}: holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}; name "
+            "another folder, or remove this one if it is not needed."
+        )
     return False
 
 
-def _identity(study: dict[str, Any]) -> tuple[str, str]:
+def _identity(study: Record) -> tuple[str, str]:
     """Return a study's name and where its recordings are: what makes a changed study the same study still."""
     data = study.get("data")
     return str(study.get("name")), str(Path(str(data.get("source"))).resolve()) if isinstance(data, dict) else "nowhere"
 
 
-def _read_study(folder: Path) -> dict[str, Any]:
+def _read_study(folder: Path) -> Record:
     try:
         content = read_json(folder / STUDY)
     except DataError as error:
@@ -277,7 +276,6 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
 @contextmanager
 def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[tuple[StudyConfig, Store]]:
     """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
-    folder = Path(folder)
     load_run(folder)
     with locked(folder, shared=not alone):
         config, store = load_run(folder)

@@ -5,24 +5,20 @@ residuals of all units            --> beside the weights                        
 the most conspicuous unit         --> against the cover of all the others                    outliers/<models>/others
 """
 
-from __future__ import annotations
-
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ...core.errors import KrosError
+from ...core import ByName, KrosError, frozen
 from ...identify import Factor, ModelSet
 from ...identify.edmd import bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
-from ...uncertainty import Form, UncertainModel, residual
-from ...uncertainty.bounded import choose_nominal
+from ...uncertainty import Form, UncertainModel, choose_nominal, residual
 from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
 from ...uncertainty.unit_residuals import NoiseShare, UnitResiduals, noise_share, unit_residuals
 from ...uncertainty.weights.cover import optimal_cover
@@ -31,7 +27,7 @@ from ..engine.context import Context
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@frozen
 class DiagnosticSettings:
     """Extent of what is computed for the report alone."""
 
@@ -98,7 +94,7 @@ def _compared(
     return noise_share(samples, scale, freqs, dt, form, units.index(nominal))
 
 
-def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:
+def _others(context: Context, rows: Sequence[ByName]) -> list[Task]:
     """Compare the most conspicuous unit with the others, where it scores highest; for both kinds as in the paper."""
     scored = [r for r in rows if r["score"] is not None]
     top = max(scored, key=lambda r: (bool(r["outlier"]), float(r["score"])), default=None)

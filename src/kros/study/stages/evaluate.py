@@ -1,7 +1,5 @@
 """Stage: run every model freely and every observer on all held-out episodes of all units in all conditions."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -10,9 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array
-from ...core.artifacts import save_artifact
-from ...core.errors import KrosError
+from ...core import AnyArray, Array, ByName, KrosError, Names, Record, save_artifact
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
@@ -24,7 +20,7 @@ from ..engine.context import Context
 from .load import run_load
 
 log = logging.getLogger(__name__)
-Pieces = dict[tuple[str, ...], Callable[[], Any]]  # work by the names of its results
+Pieces = dict[Names, Callable[[], Any]]  # work by the names of its results
 
 
 def run(context: Context) -> None:
@@ -47,7 +43,7 @@ def run(context: Context) -> None:
     free_runs: dict[str, Outcome] = {name: results.pop(f"free run/{name}") for name in kinds}  # type: ignore[misc]
     estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
     band = band_hz(context)
-    content: dict[str, Any] = {
+    content: Record = {
         "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles, band)],
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
         "band_hz": band,
@@ -81,7 +77,7 @@ def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome | st
 
 def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:
     """Do the work; return outcomes by name, observers of the study first, in its order."""
-    by_name: dict[str, Outcome | str] = {}
+    by_name = dict[str, Outcome | str]()
     for names, result in zip(work, context.work.run("evaluate", work.values()), strict=True):
         by_name |= dict(zip(names, result if isinstance(result, list) else [result], strict=True))
     return {name: by_name[name] for name in dict.fromkeys((*context.observers_record["names"], *by_name))}
@@ -92,7 +88,7 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     identified, sensor = context.identified, context.config.sensor
     first = identified.models()
     training, whole = TrainingSet.of(identified, first, sensor), TrainingSet.whole(identified, first, sensor)
-    makers: dict[str, Callable[[], Baseline]] = {}
+    makers = dict[str, Callable[[], Baseline]]()
     if first.lifting.functions or first.lifting.input_functions:
         noise = measurement_noise(identified, first, sensor)
         makers[f"{first.name}/ekf"] = partial(make_extended, training, first, context.uncertain.nominal, noise)
@@ -103,7 +99,7 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
 
 
-def facts_of(name: str, result: Outcome | str) -> Mapping[str, Any]:
+def facts_of(name: str, result: Outcome | str) -> ByName:
     """Return what the records say about a baseline that was made here."""
     if isinstance(result, Outcome):
         return result.facts
@@ -156,7 +152,7 @@ def _arrays(
     episodes: HeldOut, estimates: Mapping[str, Outcome], free_runs: Mapping[str, Outcome]
 ) -> dict[str, AnyArray]:
     """Collect the trajectories that figures need, in single precision."""
-    arrays: dict[str, Array] = {}
+    arrays = dict[str, Array]()
     for number, i in enumerate(episodes.shown):
         start = f"shown{number}"
         arrays[f"{start}/states"], arrays[f"{start}/inputs"] = episodes.population.read_parts(episodes.keys[i])

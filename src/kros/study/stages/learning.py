@@ -1,25 +1,21 @@
 """The stages from recordings to observers, which are repeated where units are left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from shutil import copyfile
 
-from ...core.artifacts import save_artifact
-from ...core.errors import ConfigError, DataError
-from ...data import Population, read
-from ...data.population import OUTLIERS
+from ...core import ConfigError, DataError, Names, save_artifact
+from ...data import OUTLIERS, Population, read
 from ...data.prepare import parse_steps, prepare
 from ...design.synthesize import synthesize_all
 from ...evaluate.over_units import draw_reserve
+from ...identify import IdentifiedModels
 from ...identify.calibration import calibrate
-from ...identify.identified import IdentifiedModels
 from ...identify.identify import with_models
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...identify.survey import Copy, check_usable, survey
+from ...observer import require_measured
 from ...observer.residual import FEWEST_SAMPLES
-from ...observer.sensor import require_measured
-from ...uncertainty.quantify import quantify
+from ...uncertainty import quantify
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep
 from .diagnose import diagnose
@@ -46,14 +42,16 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
     return population.select([u for u in population.unit_ids if u not in data.exclude])
 
 
-def draw(config: StudyConfig, population: Population) -> tuple[str, ...]:
+def draw(config: StudyConfig, population: Population) -> Names:
     """Return the units in reserve, drawn from those that the study does not name, by their places alone."""
     n, named = config.evaluate.reserve, set(config.load.units)
     pooled = [u.id for u in population.units if u.group != OUTLIERS]
     free = [u for u in pooled if u not in named]
     if n and (n > len(free) or len(pooled) - n < FEWEST):
-        there = f"there are {len(pooled)} units, {len(pooled) - len(free)} named by the study"
-        raise ConfigError(f"evaluate.reserve = {n}: {there}, and a population needs {FEWEST}; reserve fewer.")
+        raise ConfigError(
+            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} named by the study, and "
+            f"a population needs {FEWEST}; reserve fewer."
+        )
     return draw_reserve(free, n)
 
 

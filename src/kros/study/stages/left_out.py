@@ -8,21 +8,15 @@ Units in reserve are a fold that the study itself does not use: only the deploye
 bound those of the next unit.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from ...core.artifacts import load_artifact, save_artifact
-from ...core.errors import ConfigError, IdentificationError, KrosError
-from ...core.work import Progress
-from ...data.population import OUTLIERS, Population, split_episodes
-from ...design.task import is_robust
+from ...core import ConfigError, IdentificationError, KrosError, Progress, Record, load_artifact, save_artifact
+from ...data import OUTLIERS, Population, split_episodes
 from ...evaluate.held_out import HeldOut, Outcome
 from ...evaluate.over_units import fewest_units, next_unit_bound
 from ...identify.calibration import Values, unit_parameters
@@ -32,8 +26,6 @@ from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
 from .evaluate import band_hz, estimation, facts_of, outcomes
 from .learning import FEWEST, LEARNING
-
-Record = dict[str, Any]  # of JSON
 
 log = logging.getLogger(__name__)
 FOLDER, KIND = Stage.LEFT_OUT.value, "left_out"
@@ -57,8 +49,10 @@ def parted(units: Sequence[str], folds: int) -> list[list[str]]:
     """Return the units of every fold."""
     parts = [list(units[fold::folds]) for fold in range(folds)]
     if folds > len(units) or len(units) - len(parts[0]) < FEWEST:
-        problem = f"of {len(units)} units each fold needs one, and leaves at least {FEWEST} to learn from"
-        raise ConfigError(f"evaluate.folds = {folds}: {problem}; ask for another number, or record more units.")
+        raise ConfigError(
+            f"evaluate.folds = {folds}: of {len(units)} units each fold needs one, and leaves at least {FEWEST} to "
+            "learn from; ask for another number, or record more units."
+        )
     return parts
 
 
@@ -152,7 +146,7 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
     facts = replace(facts, groups=dict.fromkeys(facts.reserve, ""), train=train, test=test, reserve=())
     known: Values = {}
-    failed: dict[str, str] = {}
+    failed = dict[str, str]()
     for unit in facts.groups:
         try:
             known |= unit_parameters(whole.select([unit]), context.calibration, facts.identify_on, facts)
@@ -201,7 +195,7 @@ def facts_of_folds(folds: Sequence[dict[str, Record]]) -> dict[str, Record]:
             "made": len(designed),
             "orders": sorted({e["order"] for e in observers}),
             "relift_certified": sum(bool(e["relift_certified"]) for e in observers) if observers else None,
-            "robust": sum(is_robust(e) for e in observers) if observers else None,
+            "robust": sum(e.get("worst_case_h2") is not None for e in observers) if observers else None,
             "reasons": sorted({str(e[key]) for e in entries for key in ("reason", "relift_reason") if e.get(key)}),
         }
     return facts

@@ -11,13 +11,10 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, frozen
-from ...core.artifacts import load_artifact, save_artifact
-from ...core.errors import ConfigError, KrosError
+from ...core import Array, Columns, ConfigError, KrosError, Names, Record, frozen, load_artifact, save_artifact
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
 from ...evaluate.held_out import as_arriving
@@ -26,8 +23,6 @@ from ...motor_drive import AngleLoad
 from ...motor_drive.signals import LoadSettings, TorqueScale, known_load, load_accuracy, load_observer
 from ...observer import EstimatorSettings, Observer, run_observer
 from ..engine.context import Context
-
-Facts = dict[str, Any]  # of an estimate of the load
 
 log = logging.getLogger(__name__)
 LOAD = "load"
@@ -58,8 +53,8 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     makers = {f"{kind}/{LOAD}": partial(_with_load, context, trial, kind, lifting) for kind, lifting in trial.liftings}
     names = [f"{kind}/{TRIAL.unaware}" for kind, _ in trial.liftings]
     makers |= {f"{n}/current": partial(_from_current, trial, observers[n]) for n in names if n in observers}
-    curves: dict[str, Array] = {}
-    facts: dict[str, Facts] = {}
+    curves = dict[str, Array]()
+    facts = dict[str, Record]()
     for name, make in makers.items():
         try:
             curves[name], fact = make()
@@ -67,7 +62,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
             fact = {"status": "failed", "reason": str(error)}
             log.info("%s could not be computed: %s", name, error)
         facts |= {name: fact} if fact else {}
-    shown = int(np.flatnonzero(trial.loaded)[0])
+    shown = next(i for i, key in enumerate(trial.test.keys) if key.condition == TRIAL.condition)
     key, arrays = trial.test.keys[shown], {"truth": trial.truth[1]} | {f"estimate/{n}": v for n, v in curves.items()}
     content = {"known": trial.known, "rows": [trial.row(*item) for item in curves.items()], "observers": facts}
     content |= {"corner_hz": TRIAL.judged_hz, "settle_s": TRIAL.settle_s, "estimates": list(curves)}
@@ -76,7 +71,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     save_artifact(context.store.draft(LOAD), LOAD, content, single)
 
 
-def load_metrics(context: Context) -> Facts:
+def load_metrics(context: Context) -> Record:
     """Return what `metrics.json` says of the load; nothing where the study declares none."""
     if context.config.load.moment is None:
         return {}
@@ -84,7 +79,7 @@ def load_metrics(context: Context) -> Facts:
     return {"load_torque": {key: content[key] for key in ("known", "corner_hz", "settle_s", "observers", "rows")}}
 
 
-def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, Facts]:
+def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, Record]:
     """Return the load of an observer that has it as a state, with its level, and facts; save the observer."""
     (angle, current), test, inputs = trial.places, trial.test, context.population.inputs
     leveled = angle_load(context.config.estimator, trial.dt)
@@ -106,7 +101,7 @@ def angle_load(declared: EstimatorSettings, dt: float) -> AngleLoad:
     return AngleLoad(LoadSettings.level_s, dt, limit=max(map(abs, ends)))
 
 
-def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, Facts]:
+def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, Record]:
     """Return the paper's estimate: the error of the current, scaled where the load is known."""
     current, errors = trial.places[1], []
     for batch in (trial.train, trial.test):
@@ -123,8 +118,8 @@ class LoadTrial:
     """Recordings of a study with the load that is declared."""
 
     known: list[str]  # units
-    states: tuple[str, ...]
-    measured: tuple[int, ...]
+    states: Names
+    measured: Columns
     train: EpisodeBatch
     test: EpisodeBatch
     truth: tuple[Array, Array]  # of both, in units of current
@@ -158,12 +153,7 @@ class LoadTrial:
         """Places of angle and current among the states."""
         return self.states.index(TRIAL.angle), self.states.index(TRIAL.current)
 
-    @property
-    def loaded(self) -> Flags:
-        """Which test episodes have the load."""
-        return np.array([k.condition == TRIAL.condition for k in self.test.keys])
-
-    def row(self, name: str, estimate: Array) -> Facts:
+    def row(self, name: str, estimate: Array) -> Record:
         """Return errors of an estimate for the metrics."""
         skip = round(TRIAL.settle_s / self.dt)
         accuracy = load_accuracy(estimate, self.truth[1], self.dt, TRIAL.judged_hz, skip)

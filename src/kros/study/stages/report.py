@@ -1,11 +1,9 @@
 """Stage: write the report; also the entry points of `kros report` and `kros figures`."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 
-from ...core.work import Progress
+from ...core import Progress
 from ..config import Stage
 from ..engine.context import Context
 from ..engine.executors import open_executor

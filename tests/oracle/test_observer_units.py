@@ -31,11 +31,12 @@ def observer(injection=Injection.STATE, runtime=None):
 RUNTIMES = [
     Runtime(),
     Runtime(lower=np.array([-0.2, -0.5]), upper=np.array([0.3, np.inf]), delay=2),
+    Runtime(start=np.array([0.0, 2.0])),
 ]
 
 
 @pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
-@pytest.mark.parametrize("runtime", RUNTIMES, ids=["plain", "limits"])
+@pytest.mark.parametrize("runtime", RUNTIMES, ids=["plain", "limits", "start"])
 def test_estimates_in_other_sizes_are_the_same(injection, runtime):
     one, rng = observer(injection, runtime), np.random.default_rng(0)
     other = in_sizes(one, SIZES)

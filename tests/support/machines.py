@@ -41,6 +41,7 @@ def drive(functions=GEAR, order=2, inputs=(), gamma=(), injection=Injection.STAT
     )
 
 
+START = [0, 1.5, -0.2]
 LIMITS = {"lower": [-np.inf, -2, -0.3], "upper": [np.inf, 2, 0.3]}
 MACHINES = {
     "lifted": lambda: drive(),
@@ -49,6 +50,8 @@ MACHINES = {
     "delay": lambda: drive(delay=3),
     "limits": lambda: drive(**LIMITS),
     "delay and limits": lambda: drive(delay=2, **LIMITS),
+    "start": lambda: drive(start=START),
+    "limits, delay and start": lambda: drive(delay=2, start=START, **LIMITS),
     "through the input": lambda: drive(injection=Injection.INPUT),
     "every function": lambda: drive(SMOOTH),
     "earlier values": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate")),

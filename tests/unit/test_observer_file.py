@@ -21,7 +21,7 @@ from kros.synthesis.result import Injection
 def observer(**changes: Any) -> Observer:
     lifting = Lifting(("position", "velocity"), ("sin(3*position + phase)",), ("phase",))
     K = StateSpace(np.eye(2) / 2, np.ones((2, 1)), np.ones((3, 2)), np.ones((3, 1)), 0.01)
-    runtime = Runtime(delay=1, lower=np.array([-1.0, -np.inf]))
+    runtime = Runtime(delay=1, lower=np.array([-1.0, -np.inf]), start=np.array([0.0, 0.5]))
     parts: dict[str, Any] = {
         "A": np.diag([0.9, 0.8, 0.1]),
         "B": np.ones((3, 1)),

@@ -56,6 +56,19 @@ class Refusing(OpenLoop):
         return "it never is"
 
 
+def test_hidden_states_start_where_they_do_in_training(population: Population) -> None:
+    """A current that never is near zero: without it, every model would begin with its full size as an error."""
+    moved = np.array([0.0, 0.0, 100.0, 0.0])
+    data = {u: [population.read(key) + moved for key in population.keys(u)] for u in population.unit_ids}
+    names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
+    other = kros.from_arrays(data, **names, sample_period_s=population.sample_period_s)
+    found = kros.quantify(kros.identify(other, refine=False), n_freqs=60, max_order=1)
+    first = [data[key.unit][int(key.episode)][0] for key in found.models.facts.train]
+    for method in ("open_loop", "kalman_tuned"):
+        start = kros.synthesize(found, method, methods=()).observer.initial([0.5])
+        np.testing.assert_allclose(start, [0.5, *np.mean(first, axis=0)[1:3]], rtol=1e-9)
+
+
 def test_a_method_may_have_other_options(uncertain: UncertainModels) -> None:
     white = WorstCaseH2(corners=(None,), noises=((0.0, 0.0),), orders=(1,))
     design = kros.synthesize(uncertain, white, methods=())

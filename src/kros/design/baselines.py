@@ -84,6 +84,7 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         np.stack([10**level * shape for level in DEFAULT.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
+        training.start,
         models.parameters_of(unit),
         delay_of(training.sensor),
     )

@@ -168,8 +168,8 @@ class DesignTask:
 
     @property
     def runtime(self) -> Runtime:
-        """What observers have to know of the machine: the delay of measurements."""
-        return Runtime(delay_of(self.sensor))
+        """What observers have to know of the machine: the delay of measurements, and where hidden states start."""
+        return Runtime(delay_of(self.sensor), start=self.training.start)
 
     @property
     def selector(self) -> Array:

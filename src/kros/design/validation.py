@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import field, replace
+from functools import cached_property
 from itertools import chain, zip_longest
 
 import numpy as np
@@ -69,6 +70,13 @@ class TrainingSet:
         seen = None if self.seen is None else Seen(self.seen.measured / outputs, self.seen.inputs / inputs)
         population, sensor = scale_population(self.population, models.sizes), in_units(self.sensor, models.sizes)
         return replace(self, population=population, seen=seen, sensor=sensor)
+
+    @cached_property
+    def start(self) -> Array | None:
+        """The mean first state of the episodes, zero where it is measured; None where all of it is zero."""
+        first = EpisodeBatch.read(self.population, self.keys, 1).states[0].mean(axis=0)
+        first[np.isin(self.population.states, self.population.measured)] = 0.0
+        return first if first.any() else None
 
     def read(self, most: int | None = TRAINING.samples) -> EpisodeBatch:
         """Read the episodes, cut short, or whole with None."""

@@ -122,8 +122,8 @@ class ObserverData:
                 f"Observer {self.name}: the controller should map {q} innovations to {width} corrections "
                 f"({self.injection.value} injection), found {K.n_inputs} to {K.n_outputs}."
             )
-        for key, limit in self.runtime.limits().items():
-            self._require(f"runtime.{key}", limit.shape, (n,))
+        for key, values in self.runtime.by_state().items():
+            self._require(f"runtime.{key}", values.shape, (n,))
         if self.seen is not None:
             self._require("sizes seen in training", (self.seen.measured.shape, self.seen.inputs.shape), ((q,), (m,)))
         if self.monitor is not None:
@@ -198,10 +198,12 @@ class ObserverData:
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
     def initial(self, y: ArrayLike, parameters: Parameters | None = None, u: ArrayLike | None = None) -> Array:
-        """Return the first estimate, (..., n): measurements, and others zero or as a bank starts."""
+        """Return the first estimate, (..., n): measurements, and others as declared, zero or as a bank starts."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
         x = np.zeros((*y.shape[:-1], self.lifting.n_states))
+        if self.runtime.start is not None:
+            x[:] = self.runtime.start
         x[..., list(self.measured)] = y
         if self.bank is not None:
             inputs = np.broadcast_to(0.0 if u is None else u, (*y.shape[:-1], len(self.inputs)))

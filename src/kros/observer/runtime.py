@@ -43,7 +43,7 @@ class Seen:
 
 @frozen
 class Runtime:
-    """Delay and limits of a running observer.
+    """Delay, limits and start of a running observer.
 
     Parameters
     ----------
@@ -53,6 +53,8 @@ class Runtime:
     lower, upper : ndarray, shape (n,), optional
         Limits of the estimates that are given out, state by state. The observer goes on from its estimate without
         them: a model of a machine under control need not be stable with a state that is stuck.
+    start : ndarray, shape (n,), optional
+        First estimate of the states that are not measured; zero by default.
 
     Raises
     ------
@@ -71,18 +73,23 @@ class Runtime:
     delay: int = 0
     lower: Array | None = None
     upper: Array | None = None
+    start: Array | None = None
 
     def __post_init__(self) -> None:
         what = "Runtime of an observer"
         if int(self.delay) != self.delay or self.delay < 0:
             raise DataError(f"{what}: the delay of {self.delay} should be a whole number of samples, at least 0.")
-        floats(self, what, **dict.fromkeys(self.limits(), "numbers"))
+        floats(self, what, **dict.fromkeys(self.by_state(), "numbers"))
         if len(self.limits()) > 1 and np.any(np.greater(*self.limits().values())):
             raise DataError(f"{what}: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
 
+    def by_state(self) -> dict[str, Array]:
+        """Return what there is of every state, by name."""
+        return {name: values for name, values in vars(self).items() if name != "delay" and values is not None}
+
     def limits(self) -> dict[str, Array]:
         """Return the limits that there are, by name."""
-        return {name: side for name, side in (("lower", self.lower), ("upper", self.upper)) if side is not None}
+        return {name: values for name, values in self.by_state().items() if name != "start"}
 
     def sides(self, n: int) -> tuple[Array, Array]:
         """Return lower and upper limits of the first n states, infinite where there are none."""

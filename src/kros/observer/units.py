@@ -33,7 +33,7 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
         "seen": {"measured": y, "inputs": u[: len(observer.inputs)]},
         "monitor": {"size": y},
         "bank": {"start": 1 / np.concatenate([x, u]), "reach": y},
-        "runtime": dict.fromkeys(observer.runtime.limits(), x[: lifting.n_states]),
+        "runtime": dict.fromkeys(observer.runtime.by_state(), x[: lifting.n_states]),
     }
     parts = {name: part for name in by if (part := getattr(observer, name)) is not None}
     changed = {

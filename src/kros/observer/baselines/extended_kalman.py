@@ -34,6 +34,7 @@ class ExtendedKalman:
     Q: Array  # (n, n), process noise of the original states; or (k, n, n) for k filters at once
     R: Array  # (q, q), measurement noise
     P0: Array  # (n, n), of the first estimate
+    start: Array | None = None  # (n,), first estimate of states that are not measured; zero by default
     parameters: Mapping[str, float] = field(default_factory=dict)
     delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
 
@@ -50,6 +51,8 @@ class ExtendedKalman:
             return self._late(y, u, values)
         Q = self.Q.reshape(-1, 1, n, n)
         x, P = np.zeros((len(Q), batch, n)), np.broadcast_to(self.P0, (len(Q), batch, n, n))
+        if self.start is not None:
+            x[:] = self.start
         x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
         u = np.broadcast_to(u[:, None], (n_samples, len(Q), *u.shape[1:]))
         estimates, earlier = np.empty((n_samples, *x.shape)), None

@@ -54,12 +54,13 @@ def _campaign(name: str, result: dict[str, Any]) -> str:
     truths = dict.fromkeys(tally["truth"] for tally in tallies)
     rows = "".join(_row(tally) for tally in tallies)
     command = f"`{name}.py --seed {result['seed']}`, {result['seconds'] / 60:.1f} minutes on one core."
-    head = "| cases | number | outcomes | failures |\n|---|---|---|---|\n"
+    head = "| cases | number | outcomes, and failures if there are any |\n|---|---|---|\n"
     return f"\n## {result['title']}\n\n{command} Compared with: {'; '.join(truths)}.\n\n{head}{rows}"
 
 
 def _row(tally: dict[str, Any]) -> str:
-    cells = [tally["cases"], str(tally["tried"]), _counts(tally["outcomes"]), _counts(tally["failures"])]
+    failures = {f"FAILED, {name}": count for name, count in tally["failures"].items()}
+    cells = [tally["cases"], str(tally["tried"]), _counts(tally["outcomes"] | failures)]
     row = f"| {' | '.join(cells)} |\n"
     for long, short in SHORT.items():
         row = row.replace(long, short)
@@ -67,7 +68,7 @@ def _row(tally: dict[str, Any]) -> str:
 
 
 def _counts(counts: dict[str, int]) -> str:
-    return "; ".join(f"{name}: {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1])) or "none"
+    return "; ".join(f"{name}: {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from kros.uncertainty.quantify import UncertainModels
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 SAMPLES = 1009  # of the recording; nothing else has as many rows
+FEW = {"rows": 3000, "sample": 1000, "folds": 2, "parts": 2}  # of the estimator, which goes the same way with more
 MOST = {"recording": 7, "worst_case_h2": 6, "estimator": 6}  # packages on a way
 
 
@@ -104,7 +105,7 @@ def ways(uncertain: UncertainModels, tmp_path_factory: pytest.TempPathFactory) -
     found: dict[str, list[str]] = {}
     for method in ("worst_case_h2", "estimator"):
         with traced(is_design) as found[method]:
-            design = kros.synthesize(uncertain, method, methods=())
+            design = kros.synthesize(uncertain, method, methods=(), estimator=FEW)
     folder = tmp_path_factory.mktemp("recording")
     with traced(is_recording) as found["recording"]:
         population = recorded(folder, uncertain.models.population)

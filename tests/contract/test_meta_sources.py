@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 SRC = Path(__file__).parents[2] / "src"
-SOURCES = sorted(SRC.rglob("*.py"))
+TREES = {str(path.relative_to(SRC)): ast.parse(path.read_text(encoding="utf-8")) for path in sorted(SRC.rglob("*.py"))}
 
 Definition = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -70,8 +70,7 @@ def wrongly_documented(tree: ast.Module) -> list[str]:
 
 def complaints(check: Callable[[ast.Module], list[str]]) -> dict[str, list[str]]:
     """What a check says of each source file that is not as it should be."""
-    trees = {str(path.relative_to(SRC)): ast.parse(path.read_text(encoding="utf-8")) for path in SOURCES}
-    return {name: wrong for name, tree in trees.items() if (wrong := check(tree))}
+    return {name: wrong for name, tree in TREES.items() if (wrong := check(tree))}
 
 
 def test_everything_public_has_a_docstring() -> None:

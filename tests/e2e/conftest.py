@@ -21,14 +21,16 @@ QUICK = "rows = 6000\nsample = 2000\nfolds = 2\nparts = 2\ngap_episodes = 4\ngap
 
 
 @pytest.fixture(scope="session")
-def kros() -> Callable[..., Result]:
-    """Call the command line; returns exit code, standard output and standard error."""
+def kros() -> Iterator[Callable[..., Result]]:
+    """Call the command line in this process alone, unless workers are named; returns exit code and what is printed."""
     from kros.cli import app
 
     def call(*arguments: Any) -> Result:
         return CliRunner().invoke(app, [str(a) for a in arguments])
 
-    return call
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kros.cli._count", lambda workers: workers or 1)
+        yield call
 
 
 @pytest.fixture(scope="session")
@@ -46,7 +48,7 @@ def demo(kros, recorded, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
     quick = f"[estimator]\n{QUICK}[uncertainty]\nn_freqs = 300\n"
     (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{quick}')
-    result = kros("run", folder / "demo.toml", "--out", folder / "run", "--workers", 1)
+    result = kros("run", folder / "demo.toml", "--out", folder / "run")
     assert result.exit_code == 0, result.output
     return folder / "run"
 
@@ -59,7 +61,7 @@ def paper(kros, recorded, tmp_path_factory) -> Path:
     (folder / "paper.toml").write_text(
         f'[data]\nsource = "{recorded}"\nreader = "parquet"\n[identify]\nrefine = false\n{few}'
     )
-    result = kros("run", folder / "paper.toml", "--out", folder / "run", "--workers", 1)
+    result = kros("run", folder / "paper.toml", "--out", folder / "run")
     assert result.exit_code == 0, result.output
     return folder / "run"
 
@@ -81,7 +83,6 @@ def few_figures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("kros.report.html.draw", drawn)
         patch.setattr("kros.report.files.draw_all", lambda run: (draw(name, run) for name in some))
-        patch.setattr("kros.cli._count", lambda workers: workers or 1)
         yield
 
 

@@ -19,7 +19,7 @@ def raw(kros, tmp_path) -> Path:
 
 def refused(kros, study, tmp_path, *words, code=2, options=()):
     out = tmp_path / "out"
-    result = kros("run", study, "--out", out, "--workers", 1, *options)
+    result = kros("run", study, "--out", out, *options)
     assert result.exit_code == code, result.output
     messages = [line for line in result.stderr.splitlines() if line.startswith("kros: ")]
     assert len(messages) == 1, result.stderr
@@ -84,7 +84,7 @@ def test_one_unit_only(kros, study, tmp_path, raw):
             shutil.rmtree(folder)
     path = study(source=raw, reader="motor-drive-raw")
     refused(kros, path, tmp_path, "001001")
-    result = kros("run", path, "--out", tmp_path / "one", "--until", "identify", "--workers", 1)
+    result = kros("run", path, "--out", tmp_path / "one", "--until", "identify")
     assert result.exit_code == 0, result.output
 
 
@@ -119,10 +119,10 @@ def test_commands_on_something_that_is_not_a_run(kros, tmp_path, command):
 
 def test_bad_recordings_leave_an_earlier_run_as_it_was(kros, study, tmp_path, raw):
     path, out = study(source=raw, reader="motor-drive-raw"), tmp_path / "run"
-    assert kros("run", path, "--out", out, "--until", "calibrate", "--workers", 1).exit_code == 0
+    assert kros("run", path, "--out", out, "--until", "calibrate").exit_code == 0
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
     edit(first_csv(raw), lambda lines: lines[:2000] + lines[2010:])
-    result = kros("run", path, "--out", out, "--until", "calibrate", "--workers", 1)
+    result = kros("run", path, "--out", out, "--until", "calibrate")
     assert result.exit_code == 2
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
@@ -144,6 +144,6 @@ def test_out_of_memory_is_not_taken_for_a_damaged_file(kros, tmp_path, raw, monk
     else:
         monkeypatch.setattr("pyarrow.csv.open_csv", fail)
     (tmp_path / "study.toml").write_text(f'[data]\nsource = "{source}"\nreader = "{reader}"\n')
-    result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--workers", 1, "--until", "read")
+    result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--until", "read")
     assert result.exit_code == code, result.stderr
     assert result.stderr.startswith("kros: Memory: there is not enough of it" if code == 1 else "kros: Reading ")

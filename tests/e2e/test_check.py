@@ -71,7 +71,7 @@ def run(kros, tmp_path_factory) -> Path:
     (folder / "study.toml").write_text(
         STUDY.format(source=source).replace("refine = false", "refine = false\nalpha = 30.0")
     )
-    result = kros("run", folder / "study.toml", "--out", folder / "run", "--until", "quantify", "--workers", 1)
+    result = kros("run", folder / "study.toml", "--out", folder / "run", "--until", "quantify")
     assert result.exit_code == 0, result.output
     return folder / "run"
 
@@ -79,7 +79,7 @@ def run(kros, tmp_path_factory) -> Path:
 @pytest.fixture
 def checked(kros, run, tmp_path):
     def check(data: Path, *options: str) -> list[dict[str, Any]]:
-        result = kros("check", run, data, "--json", "--workers", 1, *options)
+        result = kros("check", run, data, "--json", *options)
         assert result.exit_code in (0, 3, 4), result.output
         rows = json.loads(result.stdout)
         words = {r["verdict"] for r in rows}
@@ -119,13 +119,13 @@ def test_bad_units_are_found(checked, run, tmp_path) -> None:
 
 
 def test_the_terminal_says_what_would_have_been_seen(kros, run, tmp_path) -> None:
-    good = kros("check", run, recordings(tmp_path / "a", NEW, 10, 400), "--workers", 1)
+    good = kros("check", run, recordings(tmp_path / "a", NEW, 10, 400))
     assert good.exit_code == 0
     lines = good.stdout.splitlines()
     assert [line.split() for line in lines[::2]] == [["PASS", unit] for unit in NEW]
     assert all("would be detected" in line for line in lines[1::2])
     data, files = recordings(tmp_path / "b", NEW, 2, 100), [tmp_path / f"units.{end}" for end in ("xml", "csv", "html")]
-    short = kros("check", run, data, "--workers", 1, *(word for file in files for word in ("--out", file)))
+    short = kros("check", run, data, *(word for file in files for word in ("--out", file)))
     assert short.exit_code == 4
     with files[1].open() as file:
         rows = list(csv.DictReader(file))
@@ -154,7 +154,7 @@ def test_units_of_the_study_are_not_held_against_themselves(checked, tmp_path) -
 
 def test_a_name_of_the_study_with_other_recordings_is_refused(kros, run, tmp_path) -> None:
     """Another drive of that name would take the study's own unit out of the comparison."""
-    refused = kros("check", run, recordings(tmp_path / "named", {"b01": 300}, 10, 400), "--workers", 1)
+    refused = kros("check", run, recordings(tmp_path / "named", {"b01": 300}, 10, 400))
     assert refused.exit_code == 2
     assert "unit b01" in refused.stderr
     assert "--same-unit" in refused.stderr
@@ -167,7 +167,7 @@ def test_a_batch_of_unequal_recordings(kros, tmp_path) -> None:
     (tmp_path / "study.toml").write_text(
         STUDY.format(source=tmp_path / "mixed").replace("refine = false", "refine = false\nalpha = 30.0")
     )
-    result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--until", "quantify", "--workers", 1)
+    result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--until", "quantify")
     assert result.exit_code == 0, result.output
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["outliers"]
     assert not any(r["outlier"] for r in rows)

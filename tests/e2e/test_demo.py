@@ -114,7 +114,7 @@ def test_a_second_run_changes_nothing_and_skips_everything(kros, demo, metrics):
     before = {
         p: p.stat().st_mtime_ns for p in demo.rglob("*") if p.is_file() and p.name not in ("metrics.json", "study.json")
     }
-    result = kros("run", demo.parent / "demo.toml", "--out", demo, "--workers", 1)
+    result = kros("run", demo.parent / "demo.toml", "--out", demo)
     assert result.exit_code == 0, result.output
     assert result.stderr.count("unchanged") == len(STAGES)
     assert {p: p.stat().st_mtime_ns for p in before} == before
@@ -167,9 +167,9 @@ def test_new_units_are_scored(kros, demo, recorded, tmp_path):
         kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code
         == 0
     )
-    assert "unit 000000" in (refused := kros("check", demo, fresh, "--workers", 1)).stderr
+    assert "unit 000000" in (refused := kros("check", demo, fresh)).stderr
     assert refused.exit_code == 2
-    result = kros("check", demo, fresh, "--json", "--workers", 1, "--same-unit")
+    result = kros("check", demo, fresh, "--json", "--same-unit")
     scores = json.loads(result.stdout)
     assert {(r["unit"], r["condition"]) for r in scores} == {
         (u, c) for u in ("000000", "001001", "001002") for c in ("noload", "load")
@@ -179,7 +179,7 @@ def test_new_units_are_scored(kros, demo, recorded, tmp_path):
     assert all(r["verdict"] == "UNDECIDED" and "needs at least 8 units" in r["reason"] for r in scores)
     recorded.rename(tmp_path / "elsewhere")
     try:
-        assert kros("check", demo, fresh, "--json", "--workers", 1, "--same-unit").stdout == result.stdout
+        assert kros("check", demo, fresh, "--json", "--same-unit").stdout == result.stdout
     finally:
         (tmp_path / "elsewhere").rename(recorded)
 

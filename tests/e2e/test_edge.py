@@ -105,7 +105,7 @@ def test_folders_that_cannot_be_made(kros, store, tmp_path, out):
         if os.geteuid() == 0:
             pytest.skip("nothing is forbidden to root")
         (tmp_path / "locked").chmod(0o500)
-    result = kros("run", study, "--out", tmp_path / out, "--until", "read", "--workers", 1)
+    result = kros("run", study, "--out", tmp_path / out, "--until", "read")
     assert result.exit_code in (1, 2)
     said(result, result.exit_code)
 
@@ -130,18 +130,6 @@ def test_an_output_that_is_full_or_gone():
     os.close(writer)
     assert done.returncode == 1
     assert done.stderr == ""
-
-
-@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
-def test_a_study_that_is_no_file(kros, tmp_path, kind):
-    path = tmp_path / "study.toml"
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "device":
-        path = Path("/dev/zero")
-    else:
-        path.mkdir()
-    said(kros("run", path, "--out", tmp_path / "out"), 2, "a regular file is needed", kind)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +159,7 @@ def test_values_on_the_command_line(kros, store, tmp_path, value):
 
 def test_an_implausible_period_is_told_with_the_results(kros, store, tmp_path):
     out = tmp_path / "out"
-    result = kros("run", store(period=1.0), "--out", out, "--until", "read", "--workers", 1)
+    result = kros("run", store(period=1.0), "--out", out, "--until", "read")
     assert result.exit_code == 0, result.output
     assert "time_scale" in result.stdout
     alerts = json.loads((out / "metrics.json").read_text())["study"]["alerts"]

@@ -123,10 +123,10 @@ WRITERS: dict[str, Callable[[Path, Array, dict[str, Array]], None]] = {
 PACKAGES = {".mat73": "h5py", ".h5": "h5py", ".mf4": "asammdf", ".tdms": "nptdms"}
 
 
-def written(folder: Path, motors, ending: str) -> Path:
+def written(folder: Path, motors, ending: str, count: int | None = None) -> Path:
     pytest.importorskip(PACKAGES.get(ending, "scipy" if ending == ".mat" else "rosbags"))
     folder.mkdir()
-    for key in motors.episodes:
+    for key in motors.episodes[:count]:
         values = motors.read(key)
         path = folder / f"motor{int(key.unit)}_run{int(key.episode) + 1}{ending.removesuffix('73')}"
         WRITERS[ending](path, motors.sample_period_s * np.arange(len(values)), as_recorded(values))
@@ -152,13 +152,13 @@ def test_files_of_a_library_are_found_and_read_in_si(kros, tmp_path, motors, end
     assert [c.unit for c in found.channels] == [units[i] if not ros else "" for i in order]
     for ours, theirs in zip(found.episodes, motors.episodes, strict=True):
         np.testing.assert_allclose(found.read(ours) * factors, motors.read(theirs)[:, order], rtol=1e-12, atol=1e-14)
-    assert kros("run", study, "--out", tmp_path / "run", "--until", "read", "--workers", 1).exit_code == 0
+    assert kros("run", study, "--out", tmp_path / "run", "--until", "read").exit_code == 0
 
 
 @pytest.mark.filterwarnings("ignore:.*:DeprecationWarning")
 @pytest.mark.parametrize("ending", WRITERS)
 def test_damaged_files_are_named(tmp_path, motors, ending, capfd):
-    folder = written(tmp_path / "recordings", motors, ending)
+    folder = written(tmp_path / "recordings", motors, ending, 1)
     path = next(p for p in sorted(folder.rglob("*")) if p.suffix in FORMATS)
     content = path.read_bytes()
     for damaged in (b"", b"garbage" * 100, content[:300], content[: len(content) // 2], content[:-20]):
@@ -186,7 +186,7 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, ending, extra):
 
 
 def test_channels_of_two_time_bases_are_refused(tmp_path, motors):
-    folder = written(tmp_path / "recordings", motors, ".h5")
+    folder = written(tmp_path / "recordings", motors, ".h5", 1)
     path = next(folder.glob("*.h5"))
     assert "bench.position" in columns_of(path)
     assert list(columns_of(path, ["slow.temperature"])) == ["slow.temperature"]

@@ -127,7 +127,7 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
         EpisodeKey(units[0], "default", "01") not in found.episodes
         or EpisodeKey(units[1], "default", "01") not in found.episodes
     )
-    assert kros("run", study, "--out", tmp_path / "run", "--until", "read", "--workers", 1).exit_code == 0
+    assert kros("run", study, "--out", tmp_path / "run", "--until", "read").exit_code == 0
 
 
 def test_roles_are_taken_from_options(kros, tmp_path, motors):

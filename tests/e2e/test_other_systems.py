@@ -15,7 +15,7 @@ UNITS, EPISODES, SECONDS = 4, 5, 10
 
 
 @pytest.fixture(scope="module")
-def pendulums(kros, tmp_path_factory):
+def pendulums(kros, few_figures, tmp_path_factory):
     """A finished study of simulated pendulums with refined models."""
     folder = tmp_path_factory.mktemp("pendulums")
     options = ("--units", UNITS, "--episodes", EPISODES, "--seconds", SECONDS)
@@ -28,7 +28,7 @@ def pendulums(kros, tmp_path_factory):
         '[synthesis]\nmethods = ["worst_case_h2"]\n'
         '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
     )
-    result = kros("run", folder / "study.toml", "--out", folder / "run", "--workers", 1)
+    result = kros("run", folder / "study.toml", "--out", folder / "run")
     assert result.exit_code == 0, result.output
     return folder
 

@@ -64,7 +64,7 @@ def run(finished, tmp_path) -> Path:
 
 
 def again(kros: Callable[..., Any], fast: Path, run: Path, *options: Any) -> Any:
-    return kros("run", fast, "--out", run, "--workers", 1, "--set", "evaluate.folds=2", *options)
+    return kros("run", fast, "--out", run, "--set", "evaluate.folds=2", *options)
 
 
 def digest(run: Path, stage: str) -> str:
@@ -142,7 +142,7 @@ def test_another_study_is_refused_and_the_same_one_may_change(kros, fast, run, p
     shutil.copytree(pendulums, tmp_path / "recordings")
     elsewhere.write_text(FAST.format(source=tmp_path / "recordings"))
     for study in (other, elsewhere):
-        found = kros("run", study, "--out", run, "--workers", 1)
+        found = kros("run", study, "--out", run)
         assert found.exit_code == 2
         assert "holds the study 'fast'" in found.stderr
         assert results(run) == before
@@ -188,10 +188,7 @@ def test_files_of_others_in_a_run_folder_stay(kros, fast, run):
     for name in ("notes.txt", "observers/notes.txt", "left_out/0/notes.txt"):
         (run / name).write_text("remember")
     crafted(run, ["notes.txt"])
-    assert (
-        kros("run", fast, "--out", run, "--workers", 1, "--until", "synthesize", "--set", "identify.alpha=90").exit_code
-        == 0
-    )
+    assert kros("run", fast, "--out", run, "--until", "synthesize", "--set", "identify.alpha=90").exit_code == 0
     assert {"notes.txt", "observers/notes.txt", "left_out/0/notes.txt"} <= files(run)
     assert not any(name.startswith("left_out/") for name in files(run) - {"left_out/0/notes.txt"})
 
@@ -228,7 +225,7 @@ def test_a_link_in_the_place_of_a_folder_of_results_is_not_followed(kros, fast, 
 
 
 def test_leftovers_are_not_believed(kros, run, pendulums, fast):
-    known = kros("check", run, pendulums, "--json", "--workers", 1)
+    known = kros("check", run, pendulums, "--json")
     assert kros("report", run).exit_code == 0
     page = (run / "report.html").read_bytes()
     for kind in ("models", "uncertainty", "outliers", "synthesis"):
@@ -237,7 +234,7 @@ def test_leftovers_are_not_believed(kros, run, pendulums, fast):
                 shutil.copytree(folder, run / kind / f"{folder.name}_ghost")
     assert kros("report", run).exit_code == 0
     assert (run / "report.html").read_bytes() == page
-    assert kros("check", run, pendulums, "--json", "--workers", 1).stdout == known.stdout
+    assert kros("check", run, pendulums, "--json").stdout == known.stdout
     found = again(kros, fast, run)
     assert found.stderr.count("unchanged") >= 8
 
@@ -257,7 +254,7 @@ def test_a_second_run_is_refused_while_the_first_lives(kros, fast, run, pendulum
             assert f"process {os.getpid()}" in found.stderr
         assert {k: v for k, v in results_of(run).items() if k != LOCK} == before
     with locked(run, shared=True):
-        assert kros("check", run, pendulums, "--workers", 1).exit_code in (0, 3, 4)
+        assert kros("check", run, pendulums).exit_code in (0, 3, 4)
         assert again(kros, fast, run).exit_code == 2
     (run / LOCK).write_text("process 1 on moon, since long ago,")  # left by one that was killed
     assert again(kros, fast, run).exit_code == 0
@@ -342,7 +339,7 @@ def test_a_run_that_is_stopped_leaves_no_workers_and_resumes(kros, fast, finishe
         assert "stopped by SIGTERM" in told
         assert "Traceback" not in told
         assert not [name for name in files(run) if Path(name).name.startswith(".")]
-    found = kros("run", fast, "--out", run, "--workers", 1, "--until", "synthesize")
+    found = kros("run", fast, "--out", run, "--until", "synthesize")
     assert found.exit_code == 0
     assert "unchanged" in found.stderr
     whole = {
@@ -361,6 +358,6 @@ def test_a_run_killed_in_the_middle_of_a_stage_leaves_only_its_draft(kros, fast,
     process.communicate()
     assert not (run / "uncertainty").exists()
     assert kros("report", run).exit_code == 2  # nothing was finished that could be shown
-    assert kros("run", fast, "--out", run, "--workers", 1, "--until", "quantify").exit_code == 0
+    assert kros("run", fast, "--out", run, "--until", "quantify").exit_code == 0
     assert not [name for name in files(run) if Path(name).name.startswith(".") or name.startswith(".")]
     assert results(run)["uncertainty/choice.json"] == results(finished)["uncertainty/choice.json"]

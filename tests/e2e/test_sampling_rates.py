@@ -53,7 +53,7 @@ def test_measured_cells_at_a_tenth_of_a_hertz_run_with_defaults(kros, few_figure
     roles = ("--measured", "voltage", "--input", "current")
     found = kros("init", recordings / "dmegc_cells", *roles, "--out", tmp_path / "study.toml")
     assert found.exit_code == 0, found.output
-    done = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--workers", 1)
+    done = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run")
     assert done.exit_code == 0, done.output
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["evaluation"]
     assert {row["unit"] for row in rows} == {"cell1", "cell2", "cell3", "cell4"}

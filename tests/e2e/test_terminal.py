@@ -90,7 +90,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
 
 
 def test_a_run_that_has_not_ended_is_listed(kros, study, tmp_path):
-    assert kros("run", study(), "--out", tmp_path / "run", "--until", "read", "--workers", 1).exit_code == 0
+    assert kros("run", study(), "--out", tmp_path / "run", "--until", "read").exit_code == 0
     assert "stages done: read" in kros("list", tmp_path / "run").output
     (tmp_path / "run" / "metrics.json").unlink()  # as where it was stopped
     found = kros("list", tmp_path / "run")

@@ -7,12 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_models import for_refinement
 
-from kros import from_arrays
 from kros.core import IdentificationError
-from kros.data import Channel, EpisodeKey, Role, Unit
-from kros.identify import Factor, KoopmanMatrices, combine, free_run
-from kros.identify.factors import lifted_factor, reduce_episode
+from kros.data import EpisodeKey
+from kros.identify import Factor, KoopmanMatrices, free_run
 from kros.identify.refine import RefineOptions, refine_population
 from kros.identify.refine.metric import ResponsePrior, peak_residual
 from kros.identify.refine.problem import stability_barrier
@@ -43,19 +42,9 @@ def simulated(lifting: Lifting, n_units: int, noise: float, seed: int, spread: f
             data[EpisodeKey(f"u{row}", "default", str(episode))] = np.hstack(
                 [x + noise * rng.standard_normal(x.shape), u]
             )
-    channels = (Channel("x", Role.STATE), Channel("v", Role.STATE), Channel("u", Role.INPUT))
-    units = tuple(Unit(f"u{row}") for row in range(n_units))
-    population = from_arrays(data, channels, 0.01)
-    keys = {unit.id: population.keys(unit.id) for unit in units}
     parameters = {"phase": phase} if lifting.parameters else {}
-    reduced = [
-        combine(stack([reduce_episode(data[k][:, :2], data[k][:, 2:], lifting) for k in ks])) for ks in keys.values()
-    ]
-    return population, keys, parameters, lifted_factor(stack(reduced), lifting, parameters, lifting), W
-
-
-def stack(factors: list[Factor]) -> Factor:
-    return Factor(*(np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples")))
+    population, keys, factor = for_refinement(data, lifting, parameters)
+    return population, keys, parameters, factor, W
 
 
 def rows(models: KoopmanMatrices) -> np.ndarray:

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from random_models import for_refinement
 
-from kros import from_arrays
-from kros.data import Channel, EpisodeKey, Role, Unit
-from kros.identify import Factor, KoopmanMatrices, combine, free_run
-from kros.identify.factors import lifted_factor, reduce_episode
+from kros.data import EpisodeKey
+from kros.identify import KoopmanMatrices, free_run
 from kros.identify.refine import RefineOptions, refine_population
 from kros.identify.refine.sensitivity import Segments, normal_equations
 from kros.lifting import Lifting
@@ -84,15 +83,7 @@ def machines(n_units: int, noise: float, seed: int, spread: float = 0.02) -> tup
             data[EpisodeKey(f"u{row}", "default", str(episode))] = np.hstack(
                 [x + noise * rng.standard_normal(x.shape), u]
             )
-    channels = (Channel("x", Role.STATE), Channel("v", Role.STATE), Channel("u", Role.INPUT))
-    units = tuple(Unit(f"u{row}") for row in range(n_units))
-    population = from_arrays(data, channels, 0.01)
-    keys = {unit.id: population.keys(unit.id) for unit in units}
-    reduced = [
-        combine(Factor.stack([reduce_episode(data[k][:, :2], data[k][:, 2:], BILINEAR) for k in ks]))
-        for ks in keys.values()
-    ]
-    return population, keys, lifted_factor(Factor.stack(reduced), BILINEAR, {}, BILINEAR), W
+    return *for_refinement(data, BILINEAR, {}), W
 
 
 def rows(models: KoopmanMatrices) -> np.ndarray:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from batches import batch_of, track_parameter
+from random_models import random_observer
 
 from kros.core.errors import ConfigError, DataError, DimensionError
-from kros.core.lti import StateSpace, gain
+from kros.core.lti import gain
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, run_observer
 from kros.synthesis import Injection, kalman
@@ -15,31 +16,8 @@ LIFTING = Lifting(("position", "velocity", "current"), ("sin(10*position + phase
 LATE = Lifting(("x", "v"), ("x[-2]*v", "sin(x)"), (), ("u",))
 
 
-def observer(lifting=LIFTING, runtime=None, injection=Injection.STATE, order=2, m=2, seed=0):
-    rng = np.random.default_rng(seed)
-    nl = lifting.n_lifted
-    A, B = 0.3 * rng.normal(size=(nl, nl)), rng.normal(size=(nl, m))
-    width = nl if injection is Injection.STATE else m
-    K = StateSpace(
-        0.3 * rng.normal(size=(order, order)),
-        rng.normal(size=(order, 1)),
-        rng.normal(size=(width, order)),
-        0.1 * rng.normal(size=(width, 1)),
-        DT,
-    )
-    return Observer(
-        "o",
-        lifting,
-        A,
-        B,
-        (0,),
-        ("a", "b")[:m],
-        K,
-        injection,
-        DT,
-        {"phase": 0.3} if lifting is LIFTING else {},
-        runtime or Runtime(),
-    )
+def observer(lifting=LIFTING, runtime=None, order=2, m=2):
+    return random_observer(lifting, order=order, inputs=("a", "b")[:m], runtime=runtime or Runtime())
 
 
 def recordings(m=2, n_samples=40, batch=2, seed=1):

@@ -6,7 +6,7 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from drives import DT, lag, servo
 
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, h2, mixed
@@ -14,8 +14,6 @@ from kros.synthesis.mixed_norms.barrier import minimise
 from kros.synthesis.mixed_norms.mixed import MixedInequalities, by_inequalities, scaled, truncate, verify
 from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.worst_case.certificate import certify
-
-DT = 1e-3
 
 
 def two_channel(rng, n=3, size2=0.3):
@@ -30,15 +28,7 @@ def two_channel(rng, n=3, size2=0.3):
 
 def drive_problem(seed, injection, order):
     rng = np.random.default_rng(seed)
-    kt, b, kp, kv, wc = np.array([60, 3, 12, 3, 600]) * np.exp(0.1 * rng.standard_normal(5))
-    A = np.array([[0, 1, 0, 0], [0, -b, kt, 2], [-wc * kv * kp, -wc * kv, -wc, 0], [0.5, 1, 0, -30]])
-    B = np.array([[0, 0], [0, 0], [wc * kv * kp, wc * kv], [0, 0]])
-    M = expm(DT * np.block([[A, B], [np.zeros((2, 6))]]))
-
-    def lag(low, high, corner_hz):
-        a = np.exp(-2 * np.pi * corner_hz * DT)
-        d, c = np.linalg.solve([[1, 1 / (1 - a)], [1, -1 / (1 + a)]], [low, high])
-        return StateSpace([[a]], [[1.0]], [[c]], [[d]], DT)
+    nominal = servo(rng)
 
     def channel():
         system = lag(10 ** rng.uniform(-2.5, -1.5), 10 ** rng.uniform(-0.9, -0.3), 10 ** rng.uniform(0.5, 2))
@@ -47,7 +37,7 @@ def drive_problem(seed, injection, order):
         return system
 
     return ObserverProblem(
-        nominal=StateSpace(M[:4, :4], M[:4, 4:], np.eye(4), np.zeros((4, 2)), DT),
+        nominal=nominal,
         C=np.eye(4)[:1],
         W_L=block_diagonal([channel(), channel()]),
         W_R=gain(np.eye(2), DT),

@@ -5,33 +5,17 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from drives import DT, lag, servo
 from scipy.optimize import minimize
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm
 from kros.synthesis import Injection, ObserverProblem, Status, worst_case_h2
 from kros.synthesis.worst_case.certificate import Ball, certify, circle_mean, density, dual_bound, spread
 
-DT = 1e-3
-
-
-def lag(low, high, corner_hz):
-    a = np.exp(-2 * np.pi * corner_hz * DT)
-    d, c = np.linalg.solve([[1, 1 / (1 - a)], [1, -1 / (1 + a)]], [low, high])
-    return StateSpace([[a]], [[1.0]], [[c]], [[d]], DT)
-
-
-def drive(rng):
-    kt, b, kp, kv, wc = np.array([60, 3, 12, 3, 600]) * np.exp(0.1 * rng.standard_normal(5))
-    A = np.array([[0, 1, 0, 0], [0, -b, kt, 2], [-wc * kv * kp, -wc * kv, -wc, 0], [0.5, 1, 0, -30]])
-    B = np.array([[0, 0], [0, 0], [wc * kv * kp, wc * kv], [0, 0]])
-    M = expm(DT * np.block([[A, B], [np.zeros((2, 6))]]))
-    return StateSpace(M[:4, :4], M[:4, 4:], np.eye(4), np.zeros((4, 2)), DT)
-
 
 def problem(seed=0, injection=Injection.STATE, **changes):
     rng = np.random.default_rng(seed)
-    nominal = drive(rng)
+    nominal = servo(rng)
     parts = {
         "nominal": nominal,
         "C": np.eye(4)[:1],

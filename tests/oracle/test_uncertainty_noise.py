@@ -33,9 +33,9 @@ def static(variation: float, noise: float, units: int = 200, draws: int = 50, se
 @pytest.mark.parametrize(("variation", "noise"), [(0.0, 0.02), (0.02, 0.02), (0.04, 0.02), (0.05, 0.0)])
 def test_static_shares(form: Form, variation: float, noise: float) -> None:
     """The mean square of 200 units has 4 x 199 degrees of freedom: 5 percent standard deviation of the ratio, less for both together."""
-    found = noise_share(static(variation, noise), ONE, FREQS, DT, form)
+    found = noise_share(static(variation, noise), ONE, FREQS[::6], DT, form)  # alike at every frequency
     expected = noise**2 / (noise**2 + variation**2)
-    assert found.ratio == pytest.approx(np.full(len(FREQS), expected), rel=0.15, abs=1e-12)
+    assert found.ratio == pytest.approx(np.full(2, expected), rel=0.15, abs=1e-12)
     assert 0 <= found.facts()["median"] <= 1
 
 

@@ -7,28 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from drives import DT, drives
 
 from kros.core import StateSpace
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.uncertainty import Form, UncertainModel, quantify
-
-DT = 1e-3
-
-
-def drives(n_units: int, seed: int) -> StateSpace:
-    """Position, velocity and current of drives under a cascaded loop, from targets of position and velocity, parameters spread by 5-15 %."""
-    rng = np.random.default_rng(seed)
-    A, B = np.zeros((n_units, 3, 3)), np.zeros((n_units, 3, 2))
-    for k in range(n_units):
-        inertia, friction, torque, lag = np.array([0.5, 6.0, 40.0, 2e-3]) * np.exp(
-            np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4)
-        )
-        a = np.array([[-0.5, 1, 0], [0, -friction / inertia, torque / inertia], [-14.4 / lag, -1.2 / lag, -1 / lag]])
-        b = np.array([[0.5, 0], [0, 0], [14.4 / lag, 1.3 / lag]])
-        step = expm(np.block([[a, b], [np.zeros((2, 5))]]) * DT)
-        A[k], B[k] = step[:3, :3], step[:3, 3:]
-    return StateSpace(A, B, np.broadcast_to(np.eye(3), A.shape), np.zeros(B.shape), DT)
 
 
 def random_population(n_units: int, seed: int) -> StateSpace:
@@ -148,10 +131,11 @@ def test_weights_are_the_same_in_other_units_of_measure_and_in_another_order(see
         np.testing.assert_allclose(product, known, rtol=1e-6)
 
 
-def test_identical_units_have_no_uncertainty() -> None:
+@pytest.mark.parametrize(("form", "count"), [("inverse_input_multiplicative", 3), ("additive", 40)])
+def test_identical_units_have_no_uncertainty(form: str, count: int) -> None:
     one = drives(1, 4)
-    units = StateSpace(*(np.repeat(getattr(one, x), 3, axis=0) for x in "ABCD"), DT)
-    model = quantify(units, freqs_hz=np.geomspace(1.0, 500.0, 20))
+    units = StateSpace(*(np.repeat(getattr(one, x), count, axis=0) for x in "ABCD"), DT)
+    model = quantify(units, form, np.geomspace(1.0, 500.0, 20))
     assert model.cover_max == 0
     assert model.peak_db[model.form] == -np.inf
     assert not model.weight.left.D.any()

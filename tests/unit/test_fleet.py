@@ -39,12 +39,6 @@ def test_weights_of_a_fleet_cover_all_of_it(form, outputs):
     assert found.cover.ratio(E).max() <= 1 + 1e-9
 
 
-def test_a_fleet_of_units_that_are_all_the_same():
-    one = fleet(1)
-    same = StateSpace(*(np.repeat(M, UNITS, axis=0) for M in (one.A, one.B, one.C, one.D)), DT)
-    assert quantify(same, "additive", np.geomspace(0.1, 49, 50), max_order=1).cover_max == 0
-
-
 def test_the_spread_of_models_is_that_of_all_pairs():
     units = fleet(30, seed=4)
     z = np.exp(1j * np.pi * np.logspace(-6, 0, 50))

@@ -7,12 +7,11 @@ import dataclasses
 import control
 import numpy as np
 import pytest
+from random_models import random_models
 
 from kros.core import DimensionError, StateSpace
-from kros.data import Channel, Role
 from kros.identify import ModelSet
 from kros.interop import from_control, to_control
-from kros.lifting import Lifting
 from kros.uncertainty import quantify
 
 DT = 0.01
@@ -28,26 +27,8 @@ def random_batch(*batch: int) -> StateSpace:
 
 
 def models(n_units: int = 3) -> ModelSet:
-    lifting = Lifting(("position", "velocity"), ("sin(0.5*position + phase)",), ("phase",))
-    rng = np.random.default_rng(2)
-    A = np.array([[0.9, 0.1, 0.0], [0.0, 0.7, 0.1], [0.0, 0.0, 0.5]]) + 0.01 * rng.normal(size=(n_units, 3, 3))
-    return ModelSet(
-        name="koopman",
-        condition="default",
-        lifting=lifting,
-        channels=(
-            Channel("position", Role.STATE, measured=True),
-            Channel("velocity", Role.STATE),
-            Channel("target", Role.INPUT),
-        ),
-        sample_period_s=DT,
-        unit_ids=tuple(f"unit.{i}" for i in range(n_units)),
-        A=A,
-        B=np.array([[0.0], [1.0], [0.3]]) + 0.01 * rng.normal(size=(n_units, 3, 1)),
-        parameters={"phase": np.zeros(n_units)},
-        output_scale=np.array([1.0, 2.0, 1.0]),
-        input_scale=np.array([3.0]),
-    )
+    formula, scale = "sin(0.5*position + phase)", np.array([1.0, 2.0, 1.0])
+    return random_models([[0.0], [1.0], [0.3]], 0.01, formula, n_units, output_scale=scale)
 
 
 def test_a_system_keeps_its_response_both_ways() -> None:

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
+from random_models import random_observer
 
 from kros.core.errors import ConfigError, DataError, DimensionError, IdentificationError
-from kros.core.lti import StateSpace
 from kros.data import Channel, EpisodeBatch, EpisodeKey, Role, from_arrays
 from kros.identify import combine, edmd, free_run
 from kros.identify.factors import Factor, lifted_factor, reduce_episode, require_excitation
 from kros.lifting import Lifting
-from kros.observer import Observer, run_observer
+from kros.observer import run_observer
 from kros.synthesis import Injection
 
 STATES, INPUTS = ("position", "current"), ("voltage", "target")
@@ -123,24 +123,10 @@ def test_a_bilinear_system_with_a_delay_is_found_exactly():
     np.testing.assert_allclose(free_run(model.A, model.B, lifting, {}, x[None, :3], u[None])[0], x, atol=1e-11)
 
 
-def observer(injection=Injection.STATE, order=2, seed=0):
-    rng = np.random.default_rng(seed)
-    width = 5 if injection is Injection.STATE else 4
-    K = StateSpace(
-        0.3 * rng.normal(size=(order, order)),
-        rng.normal(size=(order, 1)),
-        rng.normal(size=(width, order)),
-        0.1 * rng.normal(size=(width, 1)),
-        0.01,
-    )
-    A, B = 0.2 * rng.normal(size=(5, 5)), 0.3 * rng.normal(size=(5, 4))
-    return Observer("koopman/test", DELAYED, A, B, (0,), INPUTS, K, injection, 0.01, {"phase": 0.3})
-
-
 @pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
 @pytest.mark.parametrize("order", [0, 2])
 def test_batched_and_single_observers_equal_the_equations(injection, order):
-    o = observer(injection, order)
+    o = random_observer(DELAYED, injection, order, inputs=INPUTS)
     rng = np.random.default_rng(1)
     y, u, phases = rng.normal(size=(30, 3, 1)), rng.normal(size=(30, 3, 2)), np.array([0.0, 1.0, 2.0])
     batched = run_observer(o, y, u, {"phase": phases})

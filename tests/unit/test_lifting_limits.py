@@ -122,10 +122,9 @@ def test_a_slope_across_a_jump_has_no_bound(text):
     assert "not continuous" in found.reason
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_slopes_between_any_two_points_are_within_the_bounds(seed):
+def test_slopes_between_any_two_points_are_within_the_bounds():
     """Difference quotients over the whole box, across what may be a jump."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     away = {"x": (0.5, 1.2), "y": (-1, 1)}
     for text in [
         *JUMPS,
@@ -140,9 +139,9 @@ def test_slopes_between_any_two_points_are_within_the_bounds(seed):
         for box in (away, {"x": (-2, 2), "y": (-1, 1)}):
             lifting = Lifting(("x", "y"), (text,))
             (lower,), (upper,) = lifting.slope_bounds(box)
-            x = np.stack([rng.uniform(*box[name], 400) for name in ("x", "y")], axis=-1)
+            x = np.stack([rng.uniform(*box[name], 1200) for name in ("x", "y")], axis=-1)
             z = x.copy()
-            z[:, 0] = rng.uniform(*box["x"], 400)
+            z[:, 0] = rng.uniform(*box["x"], 1200)
             with np.errstate(all="ignore"):
                 quotient = (lifting.lift(x)[:, 2] - lifting.lift(z)[:, 2]) / (x - z)[:, 0]
             if np.isfinite([lower[0], upper[0]]).all():

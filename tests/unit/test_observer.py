@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from random_models import random_observer
 
 from kros.core.errors import DimensionError
-from kros.core.lti import StateSpace
 from kros.data import EpisodeBatch
 from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
@@ -13,22 +13,8 @@ from kros.synthesis import Injection
 LIFTING = Lifting(("position", "velocity", "current"), ("sin(10*position + phase)",), ("phase",))
 
 
-def observer(injection=Injection.STATE, order=2, seed=0):
-    rng = np.random.default_rng(seed)
-    A, B = 0.3 * rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
-    width = 4 if injection is Injection.STATE else 2
-    K = StateSpace(
-        0.3 * rng.normal(size=(order, order)),
-        rng.normal(size=(order, 1)),
-        rng.normal(size=(width, order)),
-        0.1 * rng.normal(size=(width, 1)),
-        0.001,
-    )
-    return Observer("koopman/test", LIFTING, A, B, (0,), ("a", "b"), K, injection, 0.001, {"phase": 0.3})
-
-
 def test_estimates_have_names_and_are_arrays():
-    o = observer()
+    o = random_observer(LIFTING)
     running = o.start([0.5], phase=1.2)
     estimate = running.step([0.4], [1.0, 2.0])
     assert running.states == ("position", "velocity", "current") == tuple(estimate)
@@ -43,7 +29,7 @@ def test_estimates_have_names_and_are_arrays():
 
 
 def test_a_controller_of_the_wrong_size_is_refused():
-    o = observer()
+    o = random_observer(LIFTING)
     with pytest.raises(DimensionError, match="1 innovations to 2 corrections"):
         Observer("x", LIFTING, o.A, o.B, (0,), ("a", "b"), o.controller, Injection.INPUT, 0.001)
     with pytest.raises(DimensionError, match="at least one sample"):
@@ -53,7 +39,7 @@ def test_a_controller_of_the_wrong_size_is_refused():
 def test_open_loop_equals_a_free_run_from_the_first_measurement():
     from kros.identify import free_run
 
-    o = observer()
+    o = random_observer(LIFTING)
     silent = Observer.open_loop("open", LIFTING, o.A, o.B, (0,), ("a", "b"), 0.001)
     rng = np.random.default_rng(2)
     y, u = rng.normal(size=(30, 4, 1)), rng.normal(size=(30, 4, 2))

@@ -26,7 +26,9 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
     train, test = (tuple(k for s in splits for k in getattr(s, part)) for part in ("train", "test"))
     facts = RecordingFacts("noload", dict.fromkeys(population.unit_ids, "population"), train, test, {})
     return SimpleNamespace(
-        config=SimpleNamespace(load=LoadConfig(**options), estimator=EstimatorSettings()),
+        config=SimpleNamespace(
+            load=LoadConfig(**options), estimator=EstimatorSettings(rows=6000, sample=2000, folds=2, parts=2)
+        ),
         facts=facts,
         population=population,
         lifting=Lifting(population.states),

@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_models import random_models
 
 from kros.core.errors import SynthesisError
-from kros.data import Channel, Role
 from kros.identify import ModelSet
-from kros.lifting import Lifting
 from kros.synthesis import Injection, ObserverProblem
 from kros.uncertainty import quantify
 
@@ -17,25 +16,8 @@ DT = 0.01
 
 @pytest.fixture(scope="module")
 def models() -> ModelSet:
-    rng = np.random.default_rng(2)
-    A = np.array([[0.9, 0.1, 0.0], [0.0, 0.7, 0.1], [0.0, 0.0, 0.5]]) + 0.003 * rng.normal(size=(4, 3, 3))
-    return ModelSet(
-        name="koopman",
-        condition="default",
-        lifting=Lifting(("position", "velocity"), ("sin(0.5*position)",)),
-        channels=(
-            Channel("position", Role.STATE, measured=True),
-            Channel("velocity", Role.STATE),
-            Channel("target", Role.INPUT),
-        ),
-        sample_period_s=DT,
-        unit_ids=tuple(f"unit.{i}" for i in range(4)),
-        A=A,
-        B=np.array([[0.1], [1.0], [0.3]]) + 0.003 * rng.normal(size=(4, 3, 1)),
-        parameters={},
-        output_scale=np.array([1.0, 2.0, 0.5]),
-        input_scale=np.array([3.0]),
-    )
+    scale = np.array([1.0, 2.0, 0.5])
+    return random_models([[0.1], [1.0], [0.3]], 0.003, "sin(0.5*position)", 4, output_scale=scale)
 
 
 @pytest.fixture(scope="module")

@@ -6,31 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from drives import drives
 
-from kros.core import StateSpace
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.uncertainty import Form, OutlierModel, score_outliers
 
-DT = 1e-3
 FREQS = np.geomspace(5e-3, 500.0, 150)
 
 
 def responses(n_units: int, seed: int, outlier: bool = False) -> np.ndarray:
-    """Drives under a velocity loop; the outlier, last, is loosely fastened: more friction, less torque, slower current."""
-    rng = np.random.default_rng(seed)
-    A, B = np.zeros((n_units, 3, 3)), np.zeros((n_units, 3, 2))
-    for k in range(n_units):
-        inertia, friction, torque, lag = np.array([0.5, 6.0, 40.0, 2e-3]) * np.exp(
-            np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4)
-        )
-        if outlier and k == n_units - 1:
-            inertia, friction, torque, lag = 1.5 * inertia, 2.5 * friction, 0.6 * torque, 2 * lag
-        a = np.array([[-0.5, 1, 0], [0, -friction / inertia, torque / inertia], [-14.4 / lag, -1.2 / lag, -1 / lag]])
-        b = np.array([[0.5, 0], [0, 0], [14.4 / lag, 1.3 / lag]])
-        step = expm(np.block([[a, b], [np.zeros((2, 5))]]) * DT)
-        A[k], B[k] = step[:3, :3], step[:3, 3:]
-    return StateSpace(A, B, np.broadcast_to(np.eye(3), A.shape), np.zeros(B.shape), DT).frequency_response(FREQS)
+    return drives(n_units, seed, outlier).frequency_response(FREQS)
 
 
 @pytest.mark.parametrize("form", [Form.ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE])

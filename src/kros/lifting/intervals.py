@@ -84,9 +84,10 @@ def _doubles(interval: Any) -> list[float]:
     """Return the ends of an interval, rounded outwards."""
     from mpmath import mpf
 
-    low, high = float(mpf(interval.a)), float(mpf(interval.b))
-    low = float(np.nextafter(low, -np.inf)) if low > mpf(interval.a) else low
-    return [low, float(np.nextafter(high, np.inf)) if high < mpf(interval.b) else high]
+    a, b = mpf(interval.a), mpf(interval.b)
+    low, high = float(a), float(b)
+    low = float(np.nextafter(low, -np.inf)) if low > a else low
+    return [low, float(np.nextafter(high, np.inf)) if high < b else high]
 
 
 def _interval(expression: Any, values: Mapping[str, Any]) -> Any:
@@ -104,8 +105,9 @@ def _interval(expression: Any, values: Mapping[str, Any]) -> Any:
         return iv.mpf(_doubles(_function(name, expression, inner)))
     if not isinstance(expression, sp.Add | sp.Mul):
         return _function(name, expression, inner)
-    if isinstance(expression, sp.Mul) and any(x == 0 for x in inner):  # zero times anything
-        return iv.mpf(0)
+    zero = _number(sp.S.Zero)
+    if expression.is_Mul and any(x == zero for x in inner):  # zero times anything
+        return zero
     return reduce(operator.add if isinstance(expression, sp.Add) else operator.mul, inner)
 
 

@@ -110,9 +110,32 @@ def bag(path: Path, time: Array, signals: dict[str, Array]) -> None:
             writer.write(connection, stamp, serialize(array(layout([], 0), row), kind.__msgtype__))
 
 
+def pandas(path: Path, time: Array, signals: dict[str, Array]) -> None:
+    """A frame with its time as an index without a name, a text, and a gap in a column of no interest."""
+    import pandas as pd
+
+    frame = pd.DataFrame({f"{name}_{RECORDED[name][0]}": values for name, values in signals.items()})
+    frame = frame.rename(columns={"voltage_V": "voltage [V]"}).assign(
+        note="bench 4", shift=pd.array([1, None] * 375)[: len(time)]
+    )
+    frame.index = pd.Timestamp("2026-01-01") + pd.to_timedelta(time, unit="s")
+    frame.to_parquet(path)
+
+
+def arrow(path: Path, time: Array, signals: dict[str, Array]) -> None:
+    import pyarrow as pa
+    from pyarrow import feather
+
+    fields = [pa.field(name, pa.float64(), metadata={"unit": RECORDED[name][0]}) for name in signals]
+    table = pa.table([time, *signals.values()], schema=pa.schema([pa.field("time", pa.float64()), *fields]))
+    feather.write_feather(table, path)
+
+
 WRITERS: dict[str, Callable[[Path, Array, dict[str, Array]], None]] = {
     ".mat": matlab,
     ".mat73": matlab_73,
+    ".parquet": pandas,
+    ".feather": arrow,
     ".h5": hdf5,
     ".mf4": mdf,
     ".tdms": tdms,
@@ -120,7 +143,14 @@ WRITERS: dict[str, Callable[[Path, Array, dict[str, Array]], None]] = {
     ".mcap": bag,
     ".db3": bag,
 }
-PACKAGES = {".mat73": "h5py", ".h5": "h5py", ".mf4": "asammdf", ".tdms": "nptdms"}
+PACKAGES = {
+    ".parquet": "pandas",
+    ".feather": "pyarrow",
+    ".mat73": "h5py",
+    ".h5": "h5py",
+    ".mf4": "asammdf",
+    ".tdms": "nptdms",
+}
 
 
 def written(folder: Path, motors, ending: str, count: int | None = None) -> Path:

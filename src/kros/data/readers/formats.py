@@ -91,8 +91,20 @@ def _bag(path: Path) -> Iterator[Group]:
         yield {name: np.array([m[name] for m in messages]) for name in names}, {"time": "s"}
 
 
+def _arrow(path: Path) -> Iterator[Group]:
+    """Parquet and Feather, as pandas writes them; a unit of measure is the field's metadatum `unit`."""
+    from pyarrow import feather, parquet
+
+    table = (parquet if path.suffix.lower() == ".parquet" else feather).read_table(path)
+    named = [(str(f.name).replace("__index_level_0__", "index"), f.metadata or {}) for f in table.schema]
+    columns = zip(named, (c.to_numpy() for c in table.columns), strict=True)
+    units = {name: metadata.get(b"unit", b"").decode() for name, metadata in named}
+    yield {name: values for (name, _), values in columns if values.dtype != object}, units  # text says nothing here
+
+
 FORMATS: dict[str, tuple[Callable[[Path], Iterator[Group]], str]] = {
     ".mat": (_matlab, "mat73"),
+    **dict.fromkeys((".parquet", ".feather"), (_arrow, "")),
     ".tdms": (_tdms, "tdms"),
     **dict.fromkeys((".h5", ".hdf5", ".hdf"), (_hdf5, "hdf5")),
     **dict.fromkeys((".mf4", ".mdf"), (_mdf, "mdf")),

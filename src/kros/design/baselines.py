@@ -84,9 +84,9 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         np.stack([10**level * shape for level in DEFAULT.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
-        training.start,
         models.parameters_of(unit),
         delay_of(training.sensor),
+        training.start,
     )
     short = batch.head(DEFAULT.extended_samples)
     estimates = filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)

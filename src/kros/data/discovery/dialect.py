@@ -13,7 +13,7 @@ import numpy as np
 
 from ...core import DataError, Names, frozen
 from ..measures import is_unit_row
-from ..readers.formats import is_binary, values_of
+from ..readers.formats import is_binary, texts_of
 from ..readers.tables import ABSENT, ORDERS, Dialect, cells_of, file_fields, head_of, lines_of, microseconds
 from .examine import RULE
 
@@ -57,8 +57,8 @@ def look_at(path: Path) -> TableHead:
     """Return how a file is written; a text file by the reading with most rows of numbers of equal width."""
     if is_binary(path):
         fields, units = file_fields(path, Dialect())
-        cells = tuple(tuple(map(str, row)) for row in values_of(path, fields)[: RULE.rows].tolist())
-        return TableHead(Dialect(), tuple(fields), tuple(units), cells)
+        cells = zip(*(texts_of(path, name)[: RULE.rows] for name in fields), strict=True)
+        return TableHead(Dialect(), tuple(fields), tuple(units), tuple(cells))
     content = head_of(path)
     encoding = encoding_of(content)
     lines = lines_of(content, encoding, path)

@@ -23,6 +23,7 @@ from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
+from .labels import label_columns, stretches
 from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
@@ -99,7 +100,7 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str
         problem = "none of the files looked at holds rows of numbers"
         raise DataError(f"Looking at {paths[0].parent}: {problem}; check the folder.")
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
-    usual = [h for h in heads if (h.dialect, h.fields) == commonest]
+    usual = (h for h in heads if (h.dialect, h.fields) == commonest)
     head = max(usual, key=lambda h: sum(map(h.is_numeric, range(len(h.fields)))))  # a sensor may have been off
     alike = {relative: path for relative, path in files.items() if _fits(path, head)}
     return head, alike, [relative for relative in files if relative not in alike]
@@ -125,6 +126,12 @@ def _columns(
     for path in paths[:: max(1, len(paths) // RULE.sampled)]:
         with suppress(DataError):
             samples.append(_read(path, head, numeric))
+    labels = dict[str, str]()
+    if not period_s and not time_columns([described[i] for i in numeric], samples):
+        labels = label_columns(paths[0], head)  # of several episodes in a file
+    if labels:
+        whole = _read(paths[0], head, numeric)
+        samples = [whole[:, rows] for rows in stretches(paths[0], head, labels.values())[: RULE.sampled]]
     samples = [s for s in samples if s.shape[1] > 2]
     if not samples:
         _read(paths[0], head, numeric)  # says why not, where it cannot be read
@@ -134,9 +141,12 @@ def _columns(
     if not period_s:
         time, keys, notes = _time(source, head, described, numeric, samples)
         described[time] = replace(described[time], part=ColumnPart.TIME)
+    keys |= {"labels": labels} if labels else {}
     proposed = dict(zip(numeric, propose([described[i] for i in numeric], samples), strict=True))
     for i, column in enumerate(described):
         described[i] = proposed.get(i, column if i == time else replace(column, why="no numbers"))
+        if column.header in labels.values():
+            described[i] = replace(column, why="says which unit, condition or episode a row belongs to")
     return [c for c, name in zip(described, head.fields, strict=True) if name], keys, notes
 
 
@@ -240,7 +250,9 @@ def _examined(
     for unit, condition in few:
         wrong |= dict.fromkeys(population.keys(unit, condition), "the only episode of its unit and condition")
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
-    mapping = mapping | _exclusion([*excluded, *(_relative(population, source, key) for key in wrong)])
+    usable_files = {_relative(population, source, key) for key in population.episodes if key not in wrong}
+    unusable = [name for key in wrong if (name := _relative(population, source, key)) not in usable_files]
+    mapping = mapping | _exclusion([*excluded, *unusable])
     retained = read_csv_folder(source, mapping)
     prepare, text = _resampling(population, source, good, bridged)
     reading = _reading(retained, source)

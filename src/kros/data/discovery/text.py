@@ -50,6 +50,8 @@ def _value(value: Any) -> str:
         return f"'{value}'" if literal else json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, list | tuple):
         return f"[{', '.join(_value(v) for v in value)}]"
+    if isinstance(value, dict):
+        return f"{{ {', '.join(key_lines(value))} }}"
     return repr(value)
 
 

@@ -96,10 +96,10 @@ def _arrow(path: Path) -> Iterator[Group]:
     from pyarrow import feather, parquet
 
     table = (parquet if path.suffix.lower() == ".parquet" else feather).read_table(path)
-    named = [(str(f.name).replace("__index_level_0__", "index"), f.metadata or {}) for f in table.schema]
-    columns = zip(named, (c.to_numpy() for c in table.columns), strict=True)
-    units = {name: metadata.get(b"unit", b"").decode() for name, metadata in named}
-    yield {name: values for (name, _), values in columns if values.dtype != object}, units  # text says nothing here
+    table = table.rename_columns([name.replace("__index_level_0__", "index") for name in table.column_names])
+    units = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in table.schema}
+    signals = {name: table[name].to_numpy() for name in table.column_names}
+    yield {name: s.astype(str) if s.dtype == object else s for name, s in signals.items()}, units
 
 
 FORMATS: dict[str, tuple[Callable[[Path], Iterator[Group]], str]] = {
@@ -125,9 +125,23 @@ def columns_of(path: Path, wanted: Collection[str | int | None] = ()) -> dict[st
 
 def values_of(path: Path, names: Sequence[str]) -> Array:
     """Return columns of one table of a file, shape (n_samples, len(names))."""
+    table = _table(path, names)
+    try:
+        return np.column_stack([table[name][0].astype(float) for name in names])
+    except ValueError as error:  # a column of text
+        raise DataError(f"Reading {path}: {error}; declare columns of numbers.") from error
+
+
+def texts_of(path: Path, name: str) -> list[str]:
+    """Return a column of a file as text."""
+    values = _table(path, [name])[name][0]
+    return [str(value).strip() if values.dtype.kind == "U" else f"{value:g}" for value in values]
+
+
+def _table(path: Path, wanted: Sequence[str]) -> dict[str, tuple[Array, str]]:
+    """Return the table of a file that holds the wanted columns."""
     version = stamp_of(path)
-    table = _tables(path, version)[_chosen(path, _heads(path, version), names)]
-    return np.column_stack([table[name][0] for name in names])
+    return _tables(path, version)[_chosen(path, _heads(path, version), wanted)]
 
 
 def _chosen(path: Path, tables: Sequence[Mapping[str, str]], wanted: Collection[str | int | None]) -> int:
@@ -155,11 +169,12 @@ def _tables(path: Path, version: tuple[int, int]) -> list[dict[str, tuple[Array,
     tables, problem = list[dict[str, tuple[Array, str]]](), "it holds no signals"
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None  # asammdf fails to delete what it could not open
     try:
-        for values, units in read(path):
+        for content, units in read(path):
             by_length = dict[int, dict[str, tuple[Array, str]]]()
-            for name, signal in _signals("", values):
+            for name, signal in _signals("", content):
                 if signal.size > 1:
-                    by_length.setdefault(len(signal), {})[name] = signal.astype(float), units.get(name, "")
+                    values = signal if signal.dtype.kind == "U" else signal.astype(float)
+                    by_length.setdefault(len(signal), {})[name] = values, units.get(name, "")
             tables += by_length.values()
     except ImportError as error:
         raise MissingDependencyError(f"Reading {path}: {error}; pip install 'kros[{extra}]'.") from error
@@ -192,5 +207,5 @@ def _signals(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     elif array.dtype.kind in "biuf" and array.ndim == 2:
         rows = array if len(array) < array.shape[1] else array.T  # a row a signal
         yield from ((f"{name}.{i}" if len(rows) > 1 else name, row) for i, row in enumerate(rows, 1))
-    elif array.dtype.kind in "biuf" and array.ndim < 2:
+    elif array.dtype.kind in "biufU" and array.ndim < 2:
         yield name, array

@@ -16,7 +16,7 @@ import numpy as np
 from ...core import AnyArray, Array, DataError, limits
 from ...core.files import pass_on_shortage, require_regular, shortened
 from ..measures import clean_unit, is_unit_row, split_header
-from .formats import columns_of, is_binary, values_of
+from .formats import columns_of, is_binary, texts_of, values_of
 
 # cells of spreadsheets without a number
 ABSENT = ("-", "--", "---", *["#DIV/0!", "#NUM!", "#REF!", "#VALUE!", "#WERT!", "#ZAHL!", "#BEZUG!", "#NV"])
@@ -120,7 +120,7 @@ def read_blocks(
 def read_labels(path: Path, fields: Sequence[str], column: int, dialect: Dialect) -> list[str]:
     """Return a column as text."""
     if is_binary(path):
-        return [f"{value:g}" for value in values_of(path, [fields[column]])[:, 0]]
+        return texts_of(path, fields[column])
     batches = _batches(path, fields, [column], dialect, [column])
     return [str(text).strip() for (labels,) in batches for text in labels.to_pylist()]
 

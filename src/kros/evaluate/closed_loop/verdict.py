@@ -38,6 +38,11 @@ class LoopResult:
     a member of the set, is not stable. UNDECIDED: there is no linear analysis, or its bounds are on both sides of the
     set.
 
+    Examples
+    --------
+    >>> from kros.evaluate.closed_loop import LoopResult
+    >>> LoopResult("SAFE", margin=2.0, destabilising=2.5, at_hz=3.0).lines()[0]
+    'SAFE: stability is proven for 2 times the uncertain set; 2.5 times the set destabilises, at 3 Hz'
     """
 
     status: str
@@ -101,6 +106,16 @@ def close_loop(
         Unknown names of signals, another sampling period, matrices that do not fit, or an observer of other lifted
         states than the models'.
 
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.evaluate.closed_loop import Controller, close_loop
+    >>> motors = kros.plants.DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1)
+    >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
+    >>> weak = Controller(D=[[-1e-4]], sample_period_s=2e-3, inputs=["velocity"], outputs=["voltage"])
+    >>> close_loop(observer, uncertain, weak).status
+    'SAFE'
     """
     controller = controller if isinstance(controller, Controller) else Controller.from_system(controller)
     kind = observer.name.partition("/")[0]

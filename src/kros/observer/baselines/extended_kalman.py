@@ -34,9 +34,9 @@ class ExtendedKalman:
     Q: Array  # (n, n), process noise of the original states; or (k, n, n) for k filters at once
     R: Array  # (q, q), measurement noise
     P0: Array  # (n, n), of the first estimate
-    start: Array | None = None  # (n,), first estimate of states that are not measured; zero by default
     parameters: Mapping[str, float] = field(default_factory=dict)
     delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
+    start: Array | None = None  # (n,), first estimate of states that are not measured; zero by default
 
     def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Predict a batch from y (n_samples, batch, q), NaN where missing, and u, shape (n_samples, batch, n)."""

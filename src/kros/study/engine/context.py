@@ -160,10 +160,9 @@ def inputs_digest(context: Context) -> str:
 
 def models_digest(context: Context) -> str:
     """Return a digest of models that are given."""
-    if context.models is None:
+    if (given := context.models) is None:
         return ""
-    sets = [(place, m.A.tobytes(), m.B.tobytes()) for place, m in context.models.sets.items()]
-    return digest_of(sets, context.models.parameters, context.models.lifting)
+    return digest_of([(m.A.tobytes(), m.B.tobytes()) for m in given.sets.values()], given.parameters, given.lifting)
 
 
 def _digest(given: Population, key: EpisodeKey) -> str:

@@ -222,3 +222,35 @@ def test_channels_of_two_time_bases_are_refused(tmp_path, motors):
     assert list(columns_of(path, ["slow.temperature"])) == ["slow.temperature"]
     with pytest.raises(DataError, match=r"bench\.time and slow\.temperature have different time bases"):
         columns_of(path, ["bench.time", "slow.temperature", None, 3])
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+@pytest.mark.parametrize("several", [False, True], ids=["one file", "a file a unit"])
+def test_columns_that_say_unit_and_episode_are_found(kros, tmp_path, motors, ending, several):
+    import pandas as pd
+
+    frames, folder, study = {}, tmp_path / "bench", tmp_path / "study.toml"
+    for key in motors.episodes:
+        values = motors.read(key)
+        frame = pd.DataFrame(values, columns=[c.name for c in motors.channels])
+        frame.insert(0, "time", motors.sample_period_s * np.arange(len(values)))
+        frame.insert(0, "run", int(key.episode) + 1)
+        frame.insert(0, "serial_number", f"SN-{key.unit}")
+        frames.setdefault(key.unit if several else "all", []).append(frame)
+    folder.mkdir()
+    for name, parts in frames.items():
+        table = pd.concat(parts, ignore_index=True)
+        table.to_csv(folder / f"motor{name}.csv", index=False) if ending == "csv" else table.to_parquet(
+            folder / f"motor{name}.parquet"
+        )
+    result = kros("init", folder, "--out", study)
+    assert result.exit_code == 0, result.output
+    found = open_source(load_config(study))
+    assert [len(keys) for _, _, keys in found.groups()] == [2] * 3
+    assert [c.name for c in found.channels] == list(NAMES)
+    np.testing.assert_allclose(found.read(found.episodes[0]), motors.read(motors.episodes[0]), atol=1e-12)
+    assert several or found.unit_ids == tuple(f"SN-{unit}" for unit in motors.unit_ids)
+    assert (
+        kros("run", study, "--out", tmp_path / "run", "--until", "identify", "--set", "identify.refine=false").exit_code
+        == 0
+    )

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.arrays import Array
-from ..core.rounding import TINY
+from ..core import TINY, Array
 from ..data.recording import CHECK
 
 

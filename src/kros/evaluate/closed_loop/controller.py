@@ -8,12 +8,8 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field
 
-from ...core.arrays import Array
-from ...core.errors import ConfigError
-from ...core.files import did_you_mean
-from ...core.lti import StateSpace, gain, real_array
-from ...core.rounding import AGREED
-from ...core.settings import Settings
+from ...core import AGREED, Array, ConfigError, Record, Settings, StateSpace, did_you_mean, gain
+from ...core.lti import real_array
 from ...identify import ModelSet
 from ...observer.data import ObserverData
 from ...observer.units import recorded_factors
@@ -46,7 +42,7 @@ class Controller(Settings):
     @classmethod
     def from_system(cls, system: Any) -> Self:
         """Return the controller of a `control.StateSpace` whose inputs and outputs are named as the channels."""
-        content: dict[str, Any] = {name: np.asarray(getattr(system, name)).tolist() for name in "ABCD"}
+        content: Record = {name: np.asarray(getattr(system, name)).tolist() for name in "ABCD"}
         content |= {f"{side}s": getattr(system, f"{side}_labels", ()) for side in ("input", "output")}
         return cls.of(content | {"sample_period_s": system.dt}, "Controller")
 

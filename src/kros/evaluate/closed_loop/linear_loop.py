@@ -13,13 +13,10 @@ u = r + K x_hat <+
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
-from ...core.errors import DimensionError, SynthesisError
-from ...core.lti import StateSpace, gain
+from ...core import AnyArray, DimensionError, Record, StateSpace, SynthesisError, frozen, gain
 from ...identify import ModelSet
 from ...lifting import Lifting
 from ...observer.data import ObserverData
@@ -64,7 +61,7 @@ class LinearLoop:
         eye, n, m = np.eye, G.n_outputs, G.n_inputs
         blocks, u, x = {"G": G, "F": self.F, "K": self.K}, {"K": eye(m), "r": eye(m)}, {"G": eye(n)}
         wires: dict[str, dict[str, AnyArray]] = {"G": dict(u), "K": {"F": eye(n)}}
-        inputs, outputs, sizes = dict[str, int](), dict[str, Any](), []
+        inputs, outputs, sizes = dict[str, int](), Record(), []
         for i, (left, right, form) in enumerate(perturbations):
             L, R, acts = f"L{i}", f"R{i}", {f"L{i}": eye(left.n_outputs)}
             blocks |= {L: left, R: right}

@@ -22,10 +22,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike, Flags, frozen
-from ...core.lti import StateSpace
+from ...core import ITERATED, TINY, AnyArray, ArrayLike, Flags, StateSpace, frozen
 from ...core.norms import balanced, crossings, first_frequencies, to_continuous
-from ...core.rounding import ITERATED, TINY
 
 _STEPS = 60  # of iterations that end much earlier
 _DECADES = 12  # of levels on both sides of one

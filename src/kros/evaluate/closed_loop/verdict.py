@@ -13,17 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import SynthesisError
-from ...core.norms import hinf_norm
+from ...core import TINY, Names, Record, SynthesisError, hinf_norm
 from ...data import EpisodeBatch
 from ...observer import Observer
-from ...uncertainty.quantify import UncertainModels
+from ...uncertainty import UncertainModels
 from .controller import Controller
 from .linear_loop import LinearLoop
 from .simulated_loop import diverging
 from .small_gain import attained, least_level
 
-ASSUMPTIONS = (
+ASSUMPTIONS: Names = (
     "for margin, gain and spectral radius the loop is linear: functions are those of the plant, nothing saturates",
     "perturbations are linear systems of the set; every measurement arrives, and in time",
     "commands are independent of one another, which recorded ones may not be",
@@ -60,8 +59,8 @@ class LoopResult:
         """Return what people read."""
         said = list(self.reasons)
         if self.margin is not None:
-            said.append(f"stability is proven for {self.margin:.4g} times the uncertain set")
-            said.append(f"{self.destabilising:.4g} times the set destabilises, at {self.at_hz:.3g} Hz")
+            said += [f"stability is proven for {self.margin:.4g} times the uncertain set"]
+            said += [f"{self.destabilising:.4g} times the set destabilises, at {self.at_hz:.3g} Hz"]
         lines = [f"{self.status}: {'; '.join(said)}"]
         if self.error_gain is not None:
             both = f"at most {self.error_gain:.4g} over the set, {self.nominal_gain:.4g} for the nominal unit"
@@ -124,36 +123,35 @@ def close_loop(
     first = [facts.keys("test", unit, models.condition)[0] for unit in covered.unit_ids]
     batch = EpisodeBatch.read(uncertain.models.population, first, samples)
     diverged = diverging(observer, models, batch, controller, largest)
-    reasons, known = [f"it diverges in simulation with {', '.join(diverged)}"] * bool(diverged), dict[str, Any]()
+    reasons, assumed = [f"it diverges in simulation with {', '.join(diverged)}"] * bool(diverged), ASSUMPTIONS
     try:
         loop, left_out = LinearLoop.of(observer, models, covered, controller.between(observer, models))
     except SynthesisError as error:
-        known["status"] = "NOT SAFE" if diverged else "UNDECIDED"
-        return LoopResult(reasons=(*reasons, f"there is no linear analysis: {error}"), diverged=diverged, **known)
+        why = (*reasons, f"there is no linear analysis: {error}")
+        return LoopResult("NOT SAFE" if diverged else "UNDECIDED", why, diverged=diverged)
     if left_out:
-        known["assumptions"] = (*ASSUMPTIONS, f"the linear estimator does without {', '.join(left_out)}")
+        assumed += (f"the linear estimator does without {', '.join(left_out)}",)
     scaled, units = models.normalised(), covered.unit_ids
     radius = {unit: loop.around(scaled.systems([unit])[0]).system.largest_pole() for unit in units}
     if unstable := [unit for unit, value in radius.items() if value >= 1]:
         reasons.append(f"it is unstable with {', '.join(unstable)}")
-    known |= bounds(loop, tolerance)
+    known = bounds(loop, tolerance)
     if known["destabilising"] <= 1:
         reasons.append("it is unstable with a member of the set")
     safe = "SAFE" if known.get("margin", 0.0) >= 1 else "UNDECIDED"
-    return LoopResult(
-        "NOT SAFE" if reasons else safe, tuple(reasons), diverged=diverged, spectral_radius=radius, **known
-    )
+    parts: Record = {"spectral_radius": radius, "diverged": diverged, "assumptions": assumed}
+    return LoopResult("NOT SAFE" if reasons else safe, tuple(reasons), **parts, **known)
 
 
-def bounds(loop: LinearLoop, tolerance: float) -> dict[str, float]:
+def bounds(loop: LinearLoop, tolerance: float) -> Record:
     """Return margin, what destabilises, and gains; where the nominal loop is not stable, that nothing is needed."""
     blocks = loop.perturbed()
     if not blocks.system.is_stable():
         return {"destabilising": 0.0}
     perturbation, block = blocks.perturbation, blocks.places[1]
     level, nu = least_level(perturbation, perturbation.places[1] >= 0, tolerance)
-    known = {"margin": 1 / level, "destabilising": 1 / attained(perturbation, nu)[0]}
-    known["at_hz"] = float(np.arctan(nu) / (np.pi * blocks.system.dt))
+    found, at_hz = max(attained(perturbation, nu)[0], TINY), float(np.arctan(nu) / (np.pi * blocks.system.dt))
+    known = {"margin": 1 / level, "destabilising": 1 / found, "at_hz": at_hz}
     if level < 1:
         known["error_gain"] = least_level(blocks, block == len(blocks.sizes) - 1, tolerance)[0]
         known["nominal_gain"] = hinf_norm(loop.around(loop.problem.scaled_model).system)

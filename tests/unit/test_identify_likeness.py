@@ -36,6 +36,11 @@ def test_another_sign_and_another_unit_of_measure_are_named(motors, name: str) -
     assert size.startswith(f"Unit {other}: {name} moves 0.01")
 
 
+def test_a_unit_that_is_moved_less_is_not_doubted(motors) -> None:
+    names = [c.name for c in motors.channels]
+    assert alerts(motors, {(motors.unit_ids[2], name): 0.05 for name in names}) == ()
+
+
 def test_moments_are_covariances_of_channels_and_changes() -> None:
     values = np.random.default_rng(0).normal(size=(50, 2)).cumsum(axis=0)
     wide = np.hstack([values[1:], values[1:] - values[:-1]])

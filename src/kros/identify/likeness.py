@@ -22,14 +22,17 @@ def unlike(units: Sequence[str], channels: Sequence[str], covariances: Sequence[
     size = np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), TINY))
     correlation = G / size[:, :, None] / size[:, None]
     ratio = size[:, :c] / np.median(size[:, :c], axis=0)
+    log, far = np.log(ratio), np.log(CHECK.ratio)
+    beside = log - np.median(log, axis=1, keepdims=True)  # other channels of the unit: it may have been moved less
+    apart = (np.abs(log) > far) & (np.abs(beside) > far / 2)
     sure = np.abs(correlation) > CHECK.correlation
     usual = np.median(correlation, axis=0)
     opposite = sure & (np.abs(usual) > CHECK.correlation) & (correlation * usual < 0)
     found = []
     for i, unit in enumerate(units):
-        for name, of in zip(channels, ratio[i].tolist(), strict=True):
-            if not 1 / CHECK.ratio < of < CHECK.ratio:
-                found.append(f"Unit {unit}: {name} moves {of:.3g} times as much as in most units; check its unit.")
+        for k in np.flatnonzero(apart[i]).tolist():
+            times = f"{channels[k]} moves {ratio[i, k]:.3g} times as much as in most units"
+            found.append(f"Unit {unit}: {times}; check its unit of measure.")
         if opposite[i].any():
             name = channels[int(opposite[i].sum(axis=0).argmax()) % c]
             found.append(f"Unit {unit}: {name} moves against other channels, unlike in most units; check its sign.")

@@ -45,9 +45,7 @@ class ChannelMapping(Settings):
     name: str = Field(description="of the channel, in everything that follows")
     role: Role = Field(description="what it is to the observer; a truth serves evaluation alone")
     column: Column | None = Field(None, description="name in the header or number from 1; default: the channel's name")
-    column_unit: str = Field(
-        "", description="unit of measure of the column; a file that states another one is converted, or refused"
-    )
+    column_unit: str = Field("", description="of the column; a file that states another one is converted, or refused")
     measured: bool = Field(False, description="whether a state is available at run time")
     unit: str = Field("", description="unit of measure after scaling")
     scale: float = Field(1.0, description="factor from the column to the channel")
@@ -84,23 +82,16 @@ class CsvMapping(Settings):
     decimal: str = Field(".", description="decimal point, for example `,` in files of some countries")
     encoding: str = Field("utf-8", description="of the text, for example cp1252 or utf-16")
     timestamp: Literal["ymd", "dmy", "mdy"] | None = Field(
-        None,
-        description="where time is a timestamp such as `2024-05-31 12:00:00.010`: the order of its date; a time of day "
-        "alone takes any of them",
+        None, description="where time is a timestamp: the order of its date; a time of day alone takes any of them"
     )
-    pieces: int = Field(
-        1, ge=1, le=100_000, description="a file is cut into episodes of equal length, `<episode>.1` ..."
-    )
+    pieces: int = Field(1, ge=1, le=100_000, description="equal episodes that a file is cut into, `<episode>.1` ...")
     labels: dict[Literal["unit", "condition", "episode"], Column] = Field(
-        {}, description='columns that state of every row what it belongs to, for example `{unit = "serial"}`'
+        {}, description='columns that state what a row belongs to, for example `{unit = "serial"}`'
     )
     trigger: Column | None = Field(
-        None,
-        description="every stretch of rows in which this column is above `threshold` is an episode, `<episode>.1` ...",
+        None, description="every stretch of rows with this column above `threshold` is an episode, `<episode>.1` ..."
     )
-    threshold: float = Field(
-        0.5, description="of the trigger, in the column's unit; the default is for a flag of 0 and 1"
-    )
+    threshold: float = Field(0.5, description="of the trigger; the default is for a flag of 0 and 1")
     prepare: tuple[Record | Step, ...] = Field((), description="preparation steps of this mapping")
     metadata: Record = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
 

@@ -10,11 +10,11 @@ from pathlib import Path
 from ...core import ByName, ConfigError, DataError, Progress, Record, Work
 from ...data import Population, detect_reader
 from ...data.discovery.discover import Discovery, Wanted, discover
-from ...data.discovery.text import comment, key_lines, mapping_lines
 from ...data.recording import check_population
 from ...identify.survey import UNLOADED, survey
 from ..config import study_schema, validate_config
 from ..stages.learning import FEWEST, open_source
+from .mapping_text import comment, key_lines, mapping_lines
 
 
 def study_text(source: Path, data: ByName, discovery: Discovery | None, findings: Sequence[str]) -> str:

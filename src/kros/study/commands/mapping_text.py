@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from ...core import ByName, Record
-from ..readers.csv_folder import CsvMapping
-from .discover import Discovery
-from .roles import ColumnPart, TableColumn
+from ...data.discovery.discover import Discovery
+from ...data.discovery.roles import ColumnPart, TableColumn
+from ...data.readers.csv_folder import CsvMapping
 
 
 def key_lines(table: ByName) -> list[str]:

@@ -5,6 +5,8 @@ met; 4 `kros check` cannot decide on a unit; 128 and the number of a signal that
 each exception, with the way to the traceback of a defect.
 """
 
+from __future__ import annotations
+
 import contextlib
 import json
 import logging

@@ -6,6 +6,8 @@ theta : 2 pi f dt, angle on the unit circle, rad
 tau : tan^2(theta / 2), zero at DC and infinite at Nyquist; equals -w^2 on the unit circle for w = (z - 1) / (z + 1)
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from .arrays import Array, ArrayLike

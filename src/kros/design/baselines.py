@@ -1,5 +1,7 @@
 """Baselines without a certificate, since they are no constant correction of a model; they run in the evaluation."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol

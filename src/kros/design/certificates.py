@@ -1,5 +1,7 @@
 """Certificates of observers for the uncertain set and as nonlinear systems, with errors and guards from training."""
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

@@ -6,6 +6,8 @@ rate on other motions (`bound_of_peaks`). It holds for units that move as those 
 observer was designed on the same units, new ones have larger innovations.
 """
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -9,7 +9,7 @@ Examples
 [[2.5]]
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 from .errors import error_percent, fit_percent
 from .over_units import unit_interval
 

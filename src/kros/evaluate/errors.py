@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..core.arrays import Array, Whole, frozen
+from ..core import Array, Whole, frozen
 
 T = TypeVar("T")
 _SEGMENT = 512  # samples of a Welch segment, as in the paper

@@ -15,12 +15,10 @@ from zlib import crc32
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, frozen
-from ..data import EpisodeBatch
-from ..data.population import EpisodeKey, Population
+from ..core import Array, ArrayLike, frozen
+from ..data import EpisodeBatch, EpisodeKey, Population
 from ..identify import ModelSet, free_run
-from ..observer import Observer
-from ..observer.sensor import Sensor, Sensors
+from ..observer import Observer, Sensor, Sensors
 from ..observer.simulate import run_observers
 from .errors import ErrorSummary, TrueErrors, joined, summarise, true_errors
 

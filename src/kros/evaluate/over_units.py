@@ -19,9 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
-from ..core.errors import DataError
-from ..core.rounding import ITERATED
+from ..core import ITERATED, Array, ArrayLike, DataError
 
 Row = Mapping[str, Any]
 _CELL = ("observer", "condition", "channel")

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.arrays import Array
-from ..data.population import EpisodeKey, Population
+from ..core import Array
+from ..data import EpisodeKey, Population
 
 
 def correlation(later: Array, earlier: Array, lags: int) -> Array:

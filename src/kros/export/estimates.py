@@ -1,5 +1,7 @@
 """Estimates of a run as a table, CSV or Parquet, written block by block."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

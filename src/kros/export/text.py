@@ -1,5 +1,7 @@
 """Names from recordings as they stand in generated text: comments, Markdown, XML, identifiers of C."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterable
 

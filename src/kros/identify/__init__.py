@@ -13,7 +13,7 @@ Examples
 import sys
 from types import ModuleType
 
-from ..core.removed import refusing
+from ..core import refusing
 from .calibration import PhaseCalibration, PhaseSpec
 from .edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from .factors import Factor, combine, episode_factors

@@ -26,12 +26,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..core.arrays import Array, Flags
-from ..core.artifacts import Storable, digest_of
-from ..core.errors import IdentificationError
-from ..core.rounding import TINY
-from ..core.work import Work
-from ..data.population import EpisodeKey, Population, split_episodes
+from ..core import TINY, Array, Flags, IdentificationError, Storable, Work, digest_of
+from ..data import EpisodeKey, Population, split_episodes
 from .survey import RecordingFacts
 
 log = logging.getLogger(__name__)

@@ -29,11 +29,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike, frozen
-from ..core.errors import DataError, IdentificationError
+from ..core import EPS, TINY, AnyArray, Array, ArrayLike, DataError, IdentificationError, StateSpace, frozen
 from ..core.linalg import qr_triangle
-from ..core.lti import StateSpace
-from ..core.rounding import EPS, TINY
 
 log = logging.getLogger(__name__)
 

@@ -24,11 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Whole, frozen
-from ..core.errors import DataError, IdentificationError
+from ..core import ROUNDING, Array, ArrayLike, DataError, IdentificationError, Whole, frozen
 from ..core.linalg import qr_triangle
-from ..core.rounding import ROUNDING
-from ..data.population import EpisodeKey, Population
+from ..data import EpisodeKey, Population
 from ..lifting import Lifting
 from ..lifting.window import FormulaSeparation
 from .edmd import KoopmanMatrices, edmd

@@ -9,8 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
-from ..core.errors import DimensionError
+from ..core import Array, ArrayLike, DimensionError
 from ..lifting import Lifting
 from ..loops import Library, formulas, library
 

@@ -11,11 +11,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ..core.arrays import frozen
-from ..core.artifacts import Storable, load_artifact, loader, save_artifact
-from ..core.errors import DataError
-from ..data.population import Population
-from ..data.shown import Shown
+from ..core import DataError, Storable, frozen, load_artifact, loader, save_artifact
+from ..data import Population, Shown
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor

@@ -16,13 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, frozen
-from ..core.artifacts import digest_of
-from ..core.errors import DataError, IdentificationError
+from ..core import Array, DataError, Flags, IdentificationError, Work, digest_of, frozen, require_kind
 from ..core.linalg import radius_text
-from ..core.settings import require_kind
-from ..core.work import Work
-from ..data.population import EpisodeKey, Population
+from ..data import EpisodeKey, Population
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array, ArrayLike
+from ..core import AnyArray, Array, ArrayLike, StateSpace
 from ..core.artifacts import Storable, divided, load_artifact, loader, save_artifact, united
 from ..core.frequency import log_grid
-from ..core.lti import StateSpace
-from ..data.population import Channel, Role
-from ..data.shown import Shown
+from ..data import Channel, Role, Shown
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
 from .factors import Ranges

@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array
-from ..core.errors import ConfigError
-from ..core.files import did_you_mean
-from ..data.population import Population, split_episodes
+from ..core import Array, ConfigError, did_you_mean
+from ..data import Population, split_episodes
 from ..lifting import Lifting
 from ..lifting.families import family
 from ..lifting.formula import Formula

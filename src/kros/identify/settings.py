@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
-from ..core.settings import Settings
+from ..core import Settings
 from ..lifting.families import check_family
 
 

@@ -15,13 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core import ITERATED, Array, DataError, Work
 from ..core.artifacts import Storable, divided, file_digest
-from ..core.errors import DataError
 from ..core.files import is_file, link_or_copy
-from ..core.rounding import ITERATED
-from ..core.work import Work
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
+from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from ..data.prepare import recording_marks
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..data.recording import CHECK, check_population, refuse_copies, some, title, usable_episodes

@@ -8,7 +8,7 @@ Examples
 [[0.0, 3.0, 0.0]]
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 from .families import delays, harmonics, kmeans_centres, polynomials, radial
 from .lifting import Lifting
 

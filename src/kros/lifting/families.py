@@ -18,8 +18,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field, FiniteFloat, ValidationError, validate_call
 
-from ..core.arrays import Array
-from ..core.errors import ConfigError
+from ..core import Array, ConfigError
 from .formula import MAX_DELAY, delayed_name
 
 Formulas = tuple[str, ...]

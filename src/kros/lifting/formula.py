@@ -20,9 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Parameters
-from ..core.errors import ConfigError
-from ..core.files import did_you_mean
+from ..core import Array, ConfigError, Parameters, did_you_mean
 from .program import FUNCTIONS, Program
 
 Names = tuple[str, ...]

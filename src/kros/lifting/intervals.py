@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array
-from ..core.errors import ConfigError
+from ..core import Array, ConfigError
 from .formula import Formula, base_and_delay
 
 Box = Mapping[str, Any]

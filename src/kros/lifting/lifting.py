@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike, Parameters
-from ..core.errors import ConfigError, DimensionError
+from ..core import Array, ArrayLike, ConfigError, DimensionError, Parameters
 from .formula import Formula, Names, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
 from .program import Program

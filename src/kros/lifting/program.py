@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.arrays import Array, frozen
-from ..core.errors import ConfigError
+from ..core import Array, ConfigError, frozen
 
 Codes = npt.NDArray[np.int32]
 Tree = tuple[Any, ...]

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core import ConfigError, DataError, DimensionError
 from ..core.arrays import Array, Index, Parameters
-from ..core.errors import ConfigError, DataError, DimensionError
 from .formula import MAX_TERMS, Formula, Names, base_and_delay, count_terms, delayed_name
 from .program import Program
 

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Parameters
-from ..core.errors import ConfigError
+from ..core import Array, ConfigError, Parameters
 from ..lifting import Lifting
 from ..lifting.program import Program
 from .compiler import load

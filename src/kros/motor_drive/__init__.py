@@ -10,7 +10,7 @@ Examples
 0.9999
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 from .signals import AngleLoad
 
 __all__ = ["AngleLoad"]

@@ -44,10 +44,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arrays import Array, ArrayLike
-from ..core.errors import ConfigError, DataError, DimensionError
-from ..data import EpisodeBatch
-from ..data.population import EpisodeKey
+from ..core import Array, ArrayLike, ConfigError, DataError, DimensionError
+from ..data import EpisodeBatch, EpisodeKey
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Observer, Recordings, identify_estimator
 

@@ -11,7 +11,7 @@ Examples
 [0.5, 0.25]
 """
 
-from ..core.removed import refusing
+from ..core import refusing
 from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
 from .estimator.build import identify_estimator

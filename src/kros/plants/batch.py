@@ -9,9 +9,8 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
-from ..core.errors import ConfigError
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
+from ..core import Array, ConfigError, frozen
+from ..data import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ..data.prepare import assemble
 from ..data.recording import Recording, Recordings
 

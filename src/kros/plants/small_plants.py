@@ -20,8 +20,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..core.arrays import Array, frozen
-from ..data.population import Channel, Role
+from ..core import Array, frozen
+from ..data import Channel, Role
 from .batch import POSITION, VELOCITY, Batch, UnitTruth
 
 CHANNELS = (

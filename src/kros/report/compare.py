@@ -1,5 +1,7 @@
 """Runs beside each other: settings and data in which they differ, and what they lead to, from settings and metrics."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

@@ -3,6 +3,8 @@
 To add a column to a table, add one `Column` where the section builds it: a title and one value a row.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from itertools import groupby
 from math import isfinite

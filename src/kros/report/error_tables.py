@@ -1,5 +1,7 @@
 """Errors of observers by channel and condition, from the rows of ``metrics.json``."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any

@@ -1,5 +1,7 @@
 """A plot of what `kros estimate` writes: estimates in their band, recorded channels behind them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

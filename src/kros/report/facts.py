@@ -1,5 +1,7 @@
 """``metrics.json`` with what verdict and sections ask of it; any part but ``study`` may be absent."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any

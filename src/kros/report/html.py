@@ -1,5 +1,7 @@
 """The report: one HTML file with everything in it."""
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial

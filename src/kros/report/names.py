@@ -1,5 +1,7 @@
 """What models, observers and channels are called and coloured: the same in every figure, table and sentence."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
 from typing import TypeVar

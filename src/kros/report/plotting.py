@@ -1,5 +1,7 @@
 """Figures of results in memory, behind their method `plot`."""
 
+from __future__ import annotations
+
 from importlib import import_module
 from inspect import signature
 from typing import Any

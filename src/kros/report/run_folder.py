@@ -3,6 +3,8 @@
 Only files in the records of the run count. What a run does not have raises `NotShownError`, whose message says why.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path, PurePosixPath

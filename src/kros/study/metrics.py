@@ -3,6 +3,8 @@
 What was not run is absent, what is unknown is null, nothing is invented.
 """
 
+from __future__ import annotations
+
 from ..core import Record, load_artifact, plain
 from ..evaluate.over_units import interval_rows
 from ..observer import Observer

@@ -10,10 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray
-from ..core.errors import DimensionError, SynthesisError
+from ..core import ITERATED, ROUNDING, TINY, AnyArray, DimensionError, SynthesisError
 from ..core.linalg import balanced_size
-from ..core.rounding import ITERATED, ROUNDING, TINY
 from .generalized_plant import GeneralizedPlant
 
 # Label and remedy of each assumption, on controls and on measurements.

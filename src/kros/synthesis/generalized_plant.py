@@ -18,10 +18,8 @@ from itertools import product
 
 import numpy as np
 
-from ..core.arrays import AnyArray, frozen
-from ..core.errors import DimensionError
+from ..core import SINGULAR, AnyArray, DimensionError, frozen
 from ..core.lti import StateSpace, block_diagonal, real_array, sampling_period
-from ..core.rounding import SINGULAR
 
 _MATRICES = ("A", "B1", "B2", "C1", "D11", "D12", "C2", "D21", "D22")  # row by row
 

@@ -5,12 +5,7 @@ from __future__ import annotations
 import logging
 from enum import Enum
 
-from ..core.arrays import frozen
-from ..core.artifacts import Storable
-from ..core.errors import SynthesisError
-from ..core.lti import StateSpace
-from ..core.rounding import AGREED
-from ..core.settings import member
+from ..core import AGREED, StateSpace, Storable, SynthesisError, frozen, member
 
 log = logging.getLogger(__name__)
 

@@ -12,8 +12,8 @@ Examples
 ('1', True)
 """
 
+from ..core import refusing
 from ..core.linalg import sigma_max
-from ..core.removed import refusing
 from .bounded import choose_nominal
 from .forms import Form, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel

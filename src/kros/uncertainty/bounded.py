@@ -17,12 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, ArrayLike, frozen
-from ..core.errors import ConfigError, DataError, DimensionError
+from ..core import ITERATED, AnyArray, ArrayLike, ConfigError, DataError, DimensionError, StateSpace, frozen
 from ..core.frequency import check_grid, log_grid
 from ..core.linalg import sigma_max
-from ..core.lti import StateSpace
-from ..core.rounding import ITERATED
 from ..identify.refine.metric import smallest_largest
 from .forms import Form, as_form, check_responses, misfit, residual
 from .model import ResponseUncertainty, UncertainModel, scale_system

@@ -27,11 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, ArrayLike
-from ..core.errors import DataError, DimensionError
+from ..core import EPS, AnyArray, ArrayLike, DataError, DimensionError, member
 from ..core.linalg import sigma_max
-from ..core.rounding import EPS
-from ..core.settings import member
 from .settings import SET
 
 

@@ -13,10 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray
-from ..core.artifacts import Storable
-from ..core.lti import StateSpace
-from ..data.shown import Shown
+from ..core import AnyArray, StateSpace, Storable
+from ..data import Shown
 from .forms import Form
 from .weights.cover import Cover, Weight
 

@@ -15,12 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import ArrayLike
-from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
-from ..core.errors import ConfigError, IdentificationError
+from ..core import (
+    ArrayLike,
+    ConfigError,
+    IdentificationError,
+    Work,
+    load_artifact,
+    loader,
+    read_json,
+    save_artifact,
+    write_json,
+)
 from ..core.linalg import sigma_max
-from ..core.work import Work
-from ..data.shown import Shown
+from ..data import Shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
 from .bounded import Options, bound_responses, bound_systems, choose_nominal, read_response_data

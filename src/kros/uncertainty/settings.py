@@ -7,8 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from ..core.rounding import ITERATED, ROUNDING
-from ..core.settings import Settings
+from ..core import ITERATED, ROUNDING, Settings
 
 FORMS = Literal[
     "additive",

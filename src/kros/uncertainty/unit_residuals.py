@@ -31,11 +31,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.arrays import AnyArray, frozen
-from ..core.artifacts import Storable, save_artifact
-from ..core.errors import DataError, DimensionError
+from ..core import (
+    AnyArray,
+    DataError,
+    DimensionError,
+    StateSpace,
+    Storable,
+    block_diagonal,
+    frozen,
+    gain,
+    save_artifact,
+)
 from ..core.linalg import sigma_max, squared
-from ..core.lti import StateSpace, block_diagonal, gain
 from ..identify.edmd import ModelSamples
 from .forms import Form, evenly, residual
 from .settings import OUTLIER, SET

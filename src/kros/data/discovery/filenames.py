@@ -5,6 +5,8 @@ by the word that it begins with or that stands before it (``run_3``), by what co
 place: units before episodes.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from itertools import chain, groupby

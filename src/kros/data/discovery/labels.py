@@ -1,5 +1,7 @@
 """Tables of several episodes: the columns that say which unit, condition and episode a row belongs to."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from itertools import accumulate, groupby
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Columns of a table: units of measure, kinds of quantities, names of channels, and what they are likely to be."""
 
+from __future__ import annotations
+
 import re
 import unicodedata
 from collections.abc import Collection, Sequence

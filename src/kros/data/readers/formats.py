@@ -4,6 +4,8 @@ A format is a function that yields signals by name, nested as in the file, and t
 it, and the extra that installs what it needs, by the end of a file's name. Text is read in blocks, by `tables`.
 """
 
+from __future__ import annotations
+
 import gc
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

@@ -1,5 +1,7 @@
 """Numbers from one table of text, fast, in bounded memory, with errors that name the file and the column."""
 
+from __future__ import annotations
+
 import codecs
 import csv
 import gzip

@@ -11,8 +11,8 @@ from pydantic import Field
 from ...core import AGREED, Array, ConfigError, Record, Settings, StateSpace, did_you_mean, gain
 from ...core.lti import real_array
 from ...identify import ModelSet
+from ...observer import recorded_factors
 from ...observer.data import ObserverData
-from ...observer.units import recorded_factors
 
 Rows = tuple[tuple[float, ...], ...]
 

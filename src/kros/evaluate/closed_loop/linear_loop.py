@@ -19,9 +19,9 @@ import numpy as np
 from ...core import AnyArray, DimensionError, Record, StateSpace, SynthesisError, frozen, gain
 from ...identify import ModelSet
 from ...lifting import Lifting
+from ...observer import delay_of
 from ...observer.data import ObserverData
 from ...observer.estimator.certificate import linear_part
-from ...observer.sensor import delay_of
 from ...synthesis import ObserverProblem
 from ...synthesis.generalized_plant import interconnect
 from ...uncertainty import Form, UncertainModel

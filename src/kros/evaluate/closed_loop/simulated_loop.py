@@ -6,8 +6,8 @@ import numpy as np
 
 from ...data import EpisodeBatch
 from ...identify import ModelSet
+from ...observer import screened
 from ...observer.data import ObserverData
-from ...observer.screen import screened
 from ...observer.simulate import Course
 from .controller import Controller
 

@@ -11,6 +11,8 @@ model, since there are more signals than equations; the smallest one is taken. G
 single precision runs so; double precision does without.
 """
 
+from __future__ import annotations
+
 from functools import lru_cache
 from typing import Any
 

@@ -3,6 +3,8 @@
 Internal states are in a real block diagonal form: two multiplications each in place of one for every other state.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

@@ -7,7 +7,7 @@ Examples
 True
 """
 
-from ...core.removed import refusing
+from ...core import refusing
 from .population import refine_population
 from .search import GaussNewton, RefineOptions
 

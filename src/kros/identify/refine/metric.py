@@ -25,9 +25,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, frozen
+from ...core import ITERATED, AnyArray, Array, frozen
 from ...core.linalg import adjoint, entries_first, multiply, sigma_max_first
-from ...core.rounding import ITERATED
 
 TIE = ITERATED  # relative; scores closer than rounding are one
 _AT_ONCE = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache

@@ -15,12 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, Flags
-from ...core.errors import IdentificationError
+from ...core import EPS, TINY, Array, Flags, IdentificationError
 from ...core.linalg import qr_triangle, radius_text
-from ...core.rounding import EPS, TINY
-from ...data import EpisodeBatch
-from ...data.population import EpisodeKey, Population
+from ...data import EpisodeBatch, EpisodeKey, Population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor, Ranges

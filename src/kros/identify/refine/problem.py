@@ -25,8 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Whole, frozen
-from ...core.rounding import TINY
+from ...core import TINY, Array, Flags, Whole, frozen
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
 from ..factors import Factor

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Whole, frozen
-from ...core.rounding import EPS, TINY
+from ...core import EPS, TINY, Array, Flags, Whole, frozen
 
 Evaluate = Callable[[Array], Array]
 

@@ -25,9 +25,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Flags, Whole, frozen
-from ...core.errors import DataError
-from ...data.population import EpisodeKey, Population
+from ...core import AnyArray, Array, DataError, Flags, Whole, frozen
+from ...data import EpisodeKey, Population
 from ...data.prepare import scale_population
 from ...lifting import Lifting
 from ...loops import Library, formulas, library

@@ -14,6 +14,8 @@ References
 B. D. O. Anderson and J. B. Moore, Optimal Filtering, Prentice-Hall 1979, section 8.2.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 

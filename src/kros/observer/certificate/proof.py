@@ -21,6 +21,8 @@ E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian e
 22 (1968) 565-578.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from itertools import product
 

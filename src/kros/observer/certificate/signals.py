@@ -11,6 +11,8 @@ holds for any slopes in their box. The right side is convex in w and the same fo
 units bounds the error for every ``sum_i a_i w_i``, ``sum_i |a_i| <= 1``, of their recordings at any times.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

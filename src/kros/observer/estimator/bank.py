@@ -16,8 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ...core.arrays import Array, Whole, frozen
-from ...core.rounding import ITERATED
+from ...core import ITERATED, Array, Whole, frozen
 from .channels import Channels
 from .settings import EstimatorSettings
 

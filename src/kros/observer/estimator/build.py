@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
-from ...core.errors import ConfigError
-from ...core.lti import gain
+from ...core import Array, ConfigError, frozen, gain
 from ...lifting import Lifting
 from ...synthesis.result import Injection
 from ..filter_bank import FilterBank

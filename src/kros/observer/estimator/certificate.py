@@ -17,10 +17,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...core.arrays import Array
-from ...core.errors import SynthesisError
-from ...core.lti import StateSpace
-from ...core.norms import hinf_norm
+from ...core import Array, StateSpace, SynthesisError, hinf_norm
 from ...lifting import Lifting
 from ..certificate.certificate import ReliftCertificate, ReliftStatus
 from ..certificate.error import ReliftScales

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, ArrayLike, frozen
+from ...core import Array, ArrayLike, frozen
 from ...lifting import Lifting
 from .settings import EstimatorSettings
 

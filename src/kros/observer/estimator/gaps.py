@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, Flags, Parameters, Whole
-from ...core.rounding import TINY
+from ...core import TINY, Array, Flags, Parameters, Whole
 from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
 from ..simulate import Course

@@ -13,9 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import Array, frozen
+from ...core import EPS, Array, frozen
 from ...core.norms import gramian_root
-from ...core.rounding import EPS
 from ...loops import recursion
 from .channels import Channels
 from .regression import Readout

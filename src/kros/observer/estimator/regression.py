@@ -17,12 +17,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Flags, Whole, frozen
-from ...core.errors import DataError
+from ...core import EPS, ROUNDING, AnyArray, Array, DataError, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
-from ...core.rounding import EPS, ROUNDING
-from ...data import EpisodeBatch
-from ...data.population import EpisodeKey
+from ...data import EpisodeBatch, EpisodeKey
 from .bank import Bank
 from .channels import Channels
 from .settings import EstimatorSettings

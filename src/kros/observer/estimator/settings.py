@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from ...core.rounding import ITERATED
-from ...core.settings import Settings
+from ...core import ITERATED, Settings
 
 
 class EstimatorSettings(Settings):

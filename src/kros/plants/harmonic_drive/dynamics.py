@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, frozen
+from ...core import AnyArray, Array, frozen
 
 GEAR_RATIO = 100
 SAMPLE_PERIOD_S = 1e-3

@@ -14,11 +14,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Flags, frozen
-from ...core.errors import ConfigError, DataError
-from ...core.settings import member
-from ...data import prepare
-from ...data.population import Channel, EpisodeKey, Role
+from ...core import AnyArray, Array, ConfigError, DataError, Flags, frozen, member
+from ...data import Channel, EpisodeKey, Role, prepare
 from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
 from ..batch import OUTLIER_STREAM, POSITION, VELOCITY, BatchSettings, SimulatedEpisodes, SimulatedPopulation, by_unit

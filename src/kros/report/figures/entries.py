@@ -1,5 +1,7 @@
 """Residuals of every unit, entry by entry, with their bound and its fit."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 

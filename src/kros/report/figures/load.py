@@ -1,5 +1,7 @@
 """Estimates of the load torque."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from ...core import load_artifact

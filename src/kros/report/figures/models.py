@@ -1,5 +1,7 @@
 """Identified models: magnitude and phase, step responses of every unit, and correlations of one-step residuals."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from ...data import EpisodeBatch

@@ -1,5 +1,7 @@
 """Figures of the recordings: signals, the tracking error's spectrum, and the phase of every unit."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from ...core import AnyArray, ConfigError

@@ -1,5 +1,7 @@
 """Correction filters beside plant and weights."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

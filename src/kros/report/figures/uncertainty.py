@@ -1,5 +1,7 @@
 """Figures of residuals and weights: six forms, weights over the optimal bound, entries of single units."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """`kros check`: scores of new units against a finished study, the level of the innovation on them, and the verdicts."""
 
+from __future__ import annotations
+
 import re
 from collections import Counter
 from pathlib import Path

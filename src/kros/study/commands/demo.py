@@ -1,5 +1,7 @@
 """Simulated recordings on disk, and the whole study on them."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Sequence
 from pathlib import Path

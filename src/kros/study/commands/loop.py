@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...core.artifacts import read_json
+from ...core import read_json
 from ...evaluate.closed_loop import Controller, LoopResult, close_loop
-from ...uncertainty.quantify import UncertainModels
+from ...uncertainty import UncertainModels
 from ..config import Stage
 from ..engine.store import open_finished
 from .field import load_observer

@@ -1,5 +1,7 @@
 """What was found in a folder, as a mapping in TOML that people can read and correct."""
 
+from __future__ import annotations
+
 import json
 import textwrap
 from collections.abc import Iterator

@@ -4,6 +4,8 @@ The result file is named by the recording, its size and the time of its last cha
 What has one is done, all else is not, and nothing else is remembered. A recording at rest is the same in two looks.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Iterator
 from contextlib import suppress

@@ -1,5 +1,7 @@
 """What every stage gets, and the stages in order: each is run, or found done by the digest of what it follows from."""
 
+from __future__ import annotations
+
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence

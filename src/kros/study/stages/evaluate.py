@@ -1,5 +1,7 @@
 """Stage: run every model freely and every observer on all held-out episodes of all units in all conditions."""
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

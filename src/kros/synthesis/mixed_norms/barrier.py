@@ -30,8 +30,7 @@ from enum import Enum
 import numpy as np
 from numpy.linalg import LinAlgError, cholesky, eigvalsh, inv, solve
 
-from ...core.arrays import AnyArray, frozen
-from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
+from ...core import EPS, ITERATED, ROUNDING, TINY, AnyArray, frozen
 
 _SHRINK, _CENTRED = 0.3, 1.0  # of mu once the decrement is below the second
 

@@ -41,12 +41,8 @@ from functools import cached_property
 import numpy as np
 from numpy.linalg import cholesky, inv, solve, svd
 
-from ...core.arrays import AnyArray, frozen
-from ...core.errors import SynthesisError
-from ...core.lti import StateSpace
+from ...core import EPS, ITERATED, TINY, AnyArray, StateSpace, SynthesisError, frozen, require_kind
 from ...core.norms import gramian, gramian_root, h2_norm, hinf_norm
-from ...core.rounding import EPS, ITERATED, TINY
-from ...core.settings import require_kind
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem, multiplied
 from ..problem.plants import mixed_plant

@@ -46,12 +46,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike, frozen
-from ...core.errors import DimensionError, SynthesisError
-from ...core.lti import StateSpace, gain
-from ...core.norms import hinf_norm
-from ...core.rounding import AGREED, TINY
-from ...core.settings import member
+from ...core import (
+    AGREED,
+    TINY,
+    AnyArray,
+    ArrayLike,
+    DimensionError,
+    StateSpace,
+    SynthesisError,
+    frozen,
+    gain,
+    hinf_norm,
+    member,
+)
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
 from ..generalized_plant import GeneralizedPlant, interconnect

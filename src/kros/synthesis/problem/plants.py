@@ -28,8 +28,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray
-from ...core.lti import StateSpace, block_diagonal, gain
+from ...core import AnyArray, StateSpace, block_diagonal, gain
 from ..generalized_plant import GeneralizedPlant, interconnect, split
 from .observer_problem import ObserverProblem
 

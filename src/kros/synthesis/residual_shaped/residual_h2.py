@@ -37,11 +37,20 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Array, Flags, frozen
-from ...core.errors import SynthesisError
-from ...core.lti import StateSpace, block_diagonal, gain
+from ...core import (
+    ITERATED,
+    ROUNDING,
+    TINY,
+    AnyArray,
+    Array,
+    Flags,
+    StateSpace,
+    SynthesisError,
+    block_diagonal,
+    frozen,
+    gain,
+)
 from ...core.norms import gramian, gramian_root, h2_norm
-from ...core.rounding import ITERATED, ROUNDING, TINY
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.h2 import balancing, kalman, predictor_bound
 

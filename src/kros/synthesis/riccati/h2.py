@@ -36,11 +36,21 @@ import time
 import numpy as np
 from numpy.linalg import LinAlgError, cholesky, cond, eigh, eigvals, eigvalsh, solve, svd
 
-from ...core.arrays import AnyArray, ArrayLike
-from ...core.errors import DimensionError, SynthesisError
-from ...core.lti import StateSpace, gain
-from ...core.norms import h2_norm, hinf_norm
-from ...core.rounding import EPS, ITERATED, ROUNDING, SINGULAR, TINY
+from ...core import (
+    EPS,
+    ITERATED,
+    ROUNDING,
+    SINGULAR,
+    TINY,
+    AnyArray,
+    ArrayLike,
+    DimensionError,
+    StateSpace,
+    SynthesisError,
+    gain,
+    h2_norm,
+    hinf_norm,
+)
 from ..assumptions import require, require_detectable
 from ..generalized_plant import GeneralizedPlant
 from ..result import Injection, Status, Synthesis

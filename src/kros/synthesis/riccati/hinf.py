@@ -27,12 +27,9 @@ import time
 import numpy as np
 from scipy.linalg import null_space
 
-from ...core.arrays import AnyArray, frozen
-from ...core.errors import ConfigError, KrosError, SynthesisError
+from ...core import AGREED, EPS, ITERATED, AnyArray, ConfigError, KrosError, StateSpace, SynthesisError, frozen, gain
 from ...core.linalg import adjoint
-from ...core.lti import StateSpace, gain
 from ...core.norms import first_frequencies, h2_norm, hinf_norm
-from ...core.rounding import AGREED, EPS, ITERATED
 from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Status, Synthesis, enclosed

@@ -26,12 +26,9 @@ import numpy as np
 from numpy.linalg import LinAlgError, cond, eigh, eigvals, eigvalsh, norm, svd
 from scipy.linalg import schur
 
-from ...core.arrays import AnyArray, frozen
-from ...core.errors import SynthesisError
+from ...core import EPS, SINGULAR, TINY, AnyArray, StateSpace, SynthesisError, frozen
 from ...core.linalg import balanced_size
-from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ...core.rounding import EPS, SINGULAR, TINY
 from ..generalized_plant import GeneralizedPlant, split
 from .h2 import absorb_feedthrough, balancing, riccati_pair
 

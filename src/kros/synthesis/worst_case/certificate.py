@@ -46,12 +46,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.linalg import norm, svd
 
-from ...core.arrays import AnyArray, frozen
-from ...core.errors import SynthesisError
+from ...core import AGREED, EPS, ITERATED, ROUNDING, TINY, AnyArray, StateSpace, SynthesisError, frozen, h2_norm
 from ...core.linalg import adjoint
-from ...core.lti import StateSpace
-from ...core.norms import h2_norm
-from ...core.rounding import AGREED, EPS, ITERATED, ROUNDING, TINY
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 

@@ -44,10 +44,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from ...core.arrays import AnyArray
-from ...core.errors import SynthesisError
-from ...core.lti import StateSpace, block_diagonal, gain
-from ...core.rounding import ROUNDING
+from ...core import ROUNDING, AnyArray, StateSpace, SynthesisError, block_diagonal, gain
 from ...uncertainty import fit_magnitude
 from ..generalized_plant import interconnect
 from ..problem.observer_problem import ObserverProblem

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Flags, frozen
+from ...core import AnyArray, Flags, frozen
 from ...core.linalg import entries_first, sigma_max_first, squared
 from ..forms import Form, evenly, residual
 from ..settings import OUTLIER

@@ -26,9 +26,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike, frozen
-from ...core.artifacts import Storable
-from ...core.errors import ConfigError, DataError
+from ...core import AnyArray, ArrayLike, ConfigError, DataError, Storable, frozen
 from ...core.frequency import check_grid
 from ..forms import Form, as_form, check_responses, evenly
 from ..settings import OUTLIER

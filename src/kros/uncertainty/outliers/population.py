@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
-from ...core.work import Work
+from ...core import AnyArray, Work, frozen
 from ...identify import Factor, ModelSet, combine
 from ...identify.factors import lifted_factor
 from ...identify.identified import EpisodeFactors, IdentifiedModels

@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Flags, frozen
+from ...core import AnyArray, Flags, frozen
 from ..forms import Form, evenly
 from ..settings import OUTLIER
 from .distances import Distances, scaled_levels

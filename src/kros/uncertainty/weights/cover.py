@@ -21,10 +21,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike, frozen
+from ...core import EPS, TINY, AnyArray, ArrayLike, StateSpace, frozen
 from ...core.linalg import entries_first, multiply, sigma_max_first, squared
-from ...core.lti import StateSpace
-from ...core.rounding import EPS, TINY
 from ..forms import evenly
 from ..settings import FIT, PROOF
 from .proof import ProofMethod

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ...core.arrays import AnyArray, Flags, frozen
+from ...core import AnyArray, Flags, StateSpace, block_diagonal, frozen, gain
 from ...core.frequency import bilinear_squared, nyquist_hz
-from ...core.lti import StateSpace, block_diagonal, gain
 from ..forms import Form, completion, evenly, residual
 from ..settings import FIT, PROOF, SET
 from .cover import Cover, Weight, optimal_cover

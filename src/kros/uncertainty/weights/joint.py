@@ -23,8 +23,7 @@ from itertools import islice
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
-from ...core.rounding import TINY
+from ...core import TINY, AnyArray, frozen
 from ..settings import FIT
 from .cover import Cover
 from .magnitude import Bound, rising_bounds

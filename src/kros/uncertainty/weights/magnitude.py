@@ -36,11 +36,20 @@ from itertools import chain, pairwise
 
 import numpy as np
 
-from ...core.arrays import AnyArray, ArrayLike, frozen
-from ...core.errors import ConfigError, DataError, DimensionError, KrosError
+from ...core import (
+    EPS,
+    TINY,
+    AnyArray,
+    ArrayLike,
+    ConfigError,
+    DataError,
+    DimensionError,
+    KrosError,
+    StateSpace,
+    frozen,
+    gain,
+)
 from ...core.frequency import bilinear_squared, check_grid
-from ...core.lti import StateSpace, gain
-from ...core.rounding import EPS, TINY
 from ..settings import MAGNITUDE, WEIGHT
 from .sections import Sections
 

@@ -26,9 +26,8 @@ from enum import Enum
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
+from ...core import AnyArray, StateSpace, frozen
 from ...core.frequency import nyquist_hz
-from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ..forms import Form, change_of, loop_of, residual_of
 from ..settings import PROOF

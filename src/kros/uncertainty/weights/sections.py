@@ -18,8 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core.arrays import AnyArray, frozen
-from ...core.lti import StateSpace, gain
+from ...core import AnyArray, StateSpace, frozen, gain
 from ..settings import MAGNITUDE
 
 _FLOAT = np.finfo(float)

@@ -47,7 +47,7 @@ from kros.design.settings import ObserverSettings, SynthesisSettings  # noqa: E4
 from kros.design.synthesize import Designs, synthesize_all  # noqa: E402
 from kros.design.validation import TrainingSet  # noqa: E402
 from kros.evaluate.errors import true_errors  # noqa: E402
-from kros.evaluate.held_out import as_shown  # noqa: E402
+from kros.evaluate.sensor import as_shown  # noqa: E402
 from kros.identify.calibration import segments_of  # noqa: E402
 from kros.observer import EstimatorSettings, Sensor, run_observer  # noqa: E402
 from kros.plants import PLANTS  # noqa: E402

@@ -25,7 +25,7 @@ from kros.design.methods import methods_of
 from kros.design.synthesize import tasks_of
 from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent
-from kros.evaluate.held_out import as_shown
+from kros.evaluate.sensor import as_shown
 from kros.identify.calibration import segments_of
 from kros.observer import Sensor, run_observer
 from kros.observer.units import in_sizes

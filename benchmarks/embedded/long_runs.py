@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from kros.data import EpisodeBatch
-from kros.evaluate.held_out import as_arriving
+from kros.evaluate.sensor import as_arriving
 from kros.export import CompiledObserver, export_c
 from kros.export.c99.numbers import Source
 from kros.identify import IdentifiedModels

@@ -16,7 +16,8 @@ from machines import LIMITS, MACHINES, drive, samples
 from kros.core.errors import ConfigError
 from kros.export import export_fmu
 from kros.identify.free_run import free_run
-from kros.identify.refine.sensitivity import Segments, normal_equations
+from kros.identify.refine.segments import Segments
+from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 from kros.loops import compiler, library, recursion
 from kros.loops.compiler import find_compiler

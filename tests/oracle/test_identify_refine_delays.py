@@ -10,7 +10,8 @@ from random_models import for_refinement
 from kros.data import EpisodeKey
 from kros.identify import KoopmanMatrices, free_run
 from kros.identify.refine import RefineOptions, refine_population
-from kros.identify.refine.sensitivity import Segments, normal_equations
+from kros.identify.refine.segments import Segments
+from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 
 DELAYED = Lifting(

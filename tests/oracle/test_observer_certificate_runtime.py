@@ -11,7 +11,7 @@ from batches import batch_of
 from frozen import compared
 
 from kros.core.lti import StateSpace
-from kros.evaluate.held_out import as_shown
+from kros.evaluate.sensor import as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, run_observer
 from kros.observer.certificate.error import error_system, state_sizes

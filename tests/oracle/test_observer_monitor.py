@@ -17,7 +17,7 @@ from kros.observer.simulate import run_innovations
 from kros.observer.units import in_sizes
 from kros.plants import HarmonicDrivePopulation
 from kros.synthesis import Injection
-from kros.uncertainty.outliers.score import prediction_bound
+from kros.uncertainty.outliers.tail import prediction_bound
 
 
 def levels(observer, y, u):

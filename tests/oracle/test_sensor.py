@@ -10,7 +10,7 @@ from tests.support.batches import batch_of
 from kros.core.errors import ConfigError
 from kros.core.lti import gain
 from kros.design.synthesize import measurement_noise
-from kros.evaluate.held_out import as_arriving, as_shown
+from kros.evaluate.sensor import as_arriving, as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Sensor
 from kros.observer.sensor import in_units, require_measured

@@ -10,7 +10,7 @@ from kros.core.linalg import qr_triangle
 from kros.identify import KoopmanMatrices
 from kros.identify.edmd import ModelSamples, bootstrap_edmd, episode_weights
 from kros.uncertainty import Form
-from kros.uncertainty.unit_residuals import noise_share
+from kros.uncertainty.noise import noise_share
 
 DT = 1e-2
 FREQS = np.geomspace(0.1, 40.0, 12)

@@ -7,7 +7,8 @@ import pytest
 from scipy import stats
 
 from kros.uncertainty import Form, score_outliers
-from kros.uncertainty.outliers.score import FEWEST_UNITS, Status, factor, margins, prediction_bound, scale, separate
+from kros.uncertainty.outliers.score import FEWEST_UNITS, Status
+from kros.uncertainty.outliers.tail import factor, margins, prediction_bound, scale, separate
 
 FREQS = np.geomspace(0.1, 100.0, 60)
 

@@ -9,7 +9,7 @@ from kros import from_arrays
 from kros.core import DataError
 from kros.data import Channel, EpisodeKey, Population, Role
 from kros.identify.refine import GaussNewton
-from kros.identify.refine.sensitivity import Segments, held_segments, read_segments
+from kros.identify.refine.segments import Segments, held_segments, read_segments
 
 
 def population(lengths: list[int]) -> tuple[Population, dict]:

@@ -19,7 +19,7 @@ import numpy as np
 from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen
 from ..observer import Observer, run_innovations, spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
-from ..uncertainty.outliers.score import LEAST_SCORES, prediction_bound
+from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
 from .validation import TrainingSet
 
 log = logging.getLogger(__name__)

@@ -13,7 +13,8 @@ from ..core import TINY, Array, frozen
 from ..data import EpisodeBatch, EpisodeKey, Population
 from ..data.prepare import scale_population
 from ..evaluate.errors import error_rms, largest
-from ..evaluate.held_out import as_shown, observers_run
+from ..evaluate.held_out import observers_run
+from ..evaluate.sensor import as_shown
 from ..identify import IdentifiedModels, ModelSet
 from ..observer import Observer, Seen, spread
 from ..observer.sensor import Sensors, in_units

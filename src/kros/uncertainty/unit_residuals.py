@@ -7,45 +7,26 @@ Pictures of an uncertain model and of an outlier show it; a unit that the weight
 paper bounds every entry by itself (its Figure 8) and puts `W Delta` with a full Delta into its generalized plant. For
 that set the bound does not hold: it says nothing about `sigma_max(W^-1 E)`, which `excess` measures. kros shows these
 weights and designs the paper's own observer with them; its sets have diagonal weights (`weights.cover`).
-
-Share of estimation noise in the differences between units: what recordings of finite length explain.
-
-    bootstrapped models of every unit --responses--> draws (unit, draw, frequency)
-    total(f) = mean over pairs of units   |E(G_k, G_i)|_F^2          what is seen: variation and noise of both estimates
-    noise(f) = mean over pairs of draws   |E(G_i*, G_i**)|_F^2       what would be seen of identical units
-    ratio(f) = noise / total
-
-For the additive form the noise of both estimates adds to the squared difference, so the ratio is an unbiased comparison
-of mean squares (the within over the total mean square of a one-way random-effects analysis of variance); for the other
-forms it is one to first order in the residual. It scatters: with identical units around one, by about ``sqrt(2 / (units
-- 1))`` and less. The share is the ratio cut at one.
-
-What the bootstrap does not see is not in it: a bias that all episodes share counts as variation where it differs
-between units.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from pathlib import Path
 
 import numpy as np
 
 from ..core import (
     AnyArray,
-    DataError,
     DimensionError,
     StateSpace,
     Storable,
     block_diagonal,
     frozen,
     gain,
-    save_artifact,
 )
-from ..core.linalg import sigma_max, squared
-from ..identify.edmd import ModelSamples
-from .forms import Form, evenly, residual
-from .settings import OUTLIER, SET
+from ..core.linalg import sigma_max
+from .forms import Form, residual
+from .settings import SET
 from .weights.cover import Cover, Weight
 from .weights.magnitude import fit_magnitude
 
@@ -124,55 +105,3 @@ def _excess(W: AnyArray, E: AnyArray) -> float:
         return float("nan")
     usable = np.linalg.cond(W) < SET.singular
     return float(sigma_max(np.linalg.solve(W[usable], E[:, usable])).max()) if usable.any() else float("nan")
-
-
-@frozen
-class NoiseShare:
-    """Mean squared residuals of a population and the part of them that recordings explain."""
-
-    freqs_hz: AnyArray  # (frequency,), Hz
-    total: AnyArray  # (frequency,): mean squared Frobenius norm of residuals between units
-    noise: AnyArray  # (frequency,): the same between resampled models of one unit
-    largest: AnyArray  # (frequency,): largest singular value of the residuals against the nominal unit
-
-    @property
-    def ratio(self) -> AnyArray:
-        """Noise over total, shape (frequency,); above one where chance has it, zero where there is neither."""
-        return np.divide(self.noise, self.total, out=np.where(self.noise > 0, np.inf, 0.0), where=self.total > 0)
-
-    def facts(self) -> dict[str, float]:
-        """Return the median share, and the share where units differ most from the nominal one."""
-        share, top = np.minimum(self.ratio, 1.0), int(self.largest.argmax())
-        return {"median": float(np.median(share)), "at_peak": float(share[top]), "peak_hz": float(self.freqs_hz[top])}
-
-    def save(self, folder: Path) -> None:
-        """Write ``noise_share.json``."""
-        save_artifact(Path(folder), "noise_share", self.facts())
-
-
-def noise_share(
-    models: ModelSamples, scale: AnyArray, freqs_hz: AnyArray, sample_period_s: float, form: Form, nominal: int = 0
-) -> NoiseShare:
-    """Compare the residuals between units with those between resampled models, of responses divided by `scale`."""
-    (units, draws, _, n), m = models.samples.A.shape, models.samples.B.shape[-1]
-    if units < 2 or draws < 2:
-        raise DataError(f"Noise share: needs at least two units and two draws of each, found {units} and {draws}.")
-    parts = (models.estimate.A, models.estimate.B, models.samples.A, models.samples.B)
-    for unit, *matrices in zip(models.unit_ids, *parts, strict=True):
-        if not all(np.isfinite(M).all() for M in matrices):
-            problem = f"unit {unit} has a model or a draw that is not finite"
-            raise DataError(f"Noise share: {problem}; leave the unit out, or raise alpha.")
-    G = models.estimate.responses(freqs_hz, sample_period_s) / scale  # (unit, frequency, n, m)
-    noise, step = np.zeros(len(freqs_hz)), max(1, OUTLIER.at_once // (draws * n * max(n, m)))
-    for row in range(units):
-        for part in (slice(start, start + step) for start in range(0, len(freqs_hz), step)):
-            drawn = models.responses(row, freqs_hz[part], sample_period_s) / scale  # (draw, frequency, n, m)
-            noise[part] += _mean_square(residual(form, drawn, np.roll(drawn, 1, axis=0))) / units
-    between = np.mean([_mean_square(residual(form, G[k], G)) for k in evenly(units, OUTLIER.nominals)], axis=0)
-    largest = sigma_max(residual(form, G[nominal], G)).max(axis=0)
-    return NoiseShare(freqs_hz, between * units / (units - 1), noise, largest)
-
-
-def _mean_square(E: AnyArray) -> AnyArray:
-    """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
-    return squared(E).sum(axis=(-2, -1)).mean(axis=0)

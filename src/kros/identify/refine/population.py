@@ -25,7 +25,7 @@ from ..free_run import free_run
 from .metric import ResponsePrior, peak_residual
 from .problem import OneStep, RefinementProblem, stability_barrier
 from .search import GaussNewton, RefineOptions, Solution
-from .sensitivity import Segments, TrainingData, held_segments, read_segments
+from .segments import Segments, TrainingData, held_segments, read_segments
 
 log = logging.getLogger(__name__)
 

@@ -31,7 +31,8 @@ from ..edmd import KoopmanMatrices
 from ..factors import Factor
 from .metric import ResponsePrior
 from .search import RefineOptions
-from .sensitivity import Normal, Segments, normal_equations
+from .segments import Segments
+from .sensitivity import Normal, normal_equations
 
 
 @frozen

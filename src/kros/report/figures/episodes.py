@@ -12,7 +12,8 @@ from ...core import AnyArray, ConfigError, frozen
 from ...data import Channel, EpisodeBatch, EpisodeKey, Population, Role
 from ...evaluate import fit_percent
 from ...evaluate.errors import error_spectrum
-from ...evaluate.held_out import HeldOut, as_shown
+from ...evaluate.held_out import HeldOut
+from ...evaluate.sensor import as_shown
 from ...identify import IdentifiedModels
 from ...observer import run_observer
 from ..canvas import Axes, Captioned, Figure, frequency_axis, grid, label_below, legend, logarithmic, set_titles, thin

@@ -10,7 +10,7 @@ import numpy as np
 from ...core import ConfigError, KrosError, write_json
 from ...data import EpisodeBatch
 from ...data.discovery.roles import identifier
-from ...evaluate.held_out import as_arriving
+from ...evaluate.sensor import as_arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
 from ...identify.survey import RecordingFacts
 from ...loops.compiler import find_compiler

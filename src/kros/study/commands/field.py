@@ -27,7 +27,7 @@ from ...core import (
 )
 from ...data import EpisodeKey, Population, read
 from ...data.prepare import with_gaps
-from ...evaluate.held_out import Arriving, arriving
+from ...evaluate.sensor import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibration import Texts, Values, unit_values
 from ...identify.survey import RecordingFacts

@@ -21,8 +21,9 @@ from ...identify import Factor, ModelSet
 from ...identify.edmd import bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
 from ...uncertainty import Form, UncertainModel, choose_nominal, residual
+from ...uncertainty.noise import NoiseShare, noise_share
 from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
-from ...uncertainty.unit_residuals import NoiseShare, UnitResiduals, noise_share, unit_residuals
+from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ...uncertainty.weights.cover import optimal_cover
 from ..engine.context import Context
 

@@ -17,7 +17,7 @@ import numpy as np
 from ...core import Array, Columns, ConfigError, KrosError, Names, Record, frozen, load_artifact, save_artifact
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
-from ...evaluate.held_out import as_arriving
+from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
 from ...motor_drive import AngleLoad
 from ...motor_drive.signals import LoadSettings, TorqueScale, known_load, load_accuracy, load_observer

@@ -31,7 +31,8 @@ from ...core.frequency import check_grid
 from ..forms import Form, as_form, check_responses, evenly
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
-from .score import LEAST_SCORES, Comparison, OutlierScore, Status, margins, separate
+from .score import Comparison, OutlierScore, Status
+from .tail import LEAST_SCORES, margins, separate
 
 
 @frozen

@@ -24,7 +24,8 @@ from ...identify.identified import EpisodeFactors, IdentifiedModels
 from ..forms import evenly
 from ..settings import OUTLIER, QuantifySettings
 from .model import OutlierModel, score_outliers
-from .score import LEAST_SCORES, OutlierScore, Status
+from .score import OutlierScore, Status
+from .tail import LEAST_SCORES
 
 log = logging.getLogger(__name__)
 

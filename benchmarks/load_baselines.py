@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kros.core.lti import gain
-from kros.motor_drive.signals import LOAD, low_passed
+from kros.motor_drive.observer import LOAD
+from kros.motor_drive.signals import low_passed
 from kros.observer import Observer
 from kros.synthesis.result import Injection
 from kros.synthesis.riccati.h2 import kalman

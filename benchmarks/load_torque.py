@@ -26,7 +26,8 @@ from kros.identify import PhaseSpec
 from kros.identify.calibration import find_segments, resolve_branches, unit_phase
 from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad
-from kros.motor_drive.signals import LoadSettings, TorqueScale, load_accuracy, load_observer, low_passed, without_level
+from kros.motor_drive.observer import LoadSettings, load_observer
+from kros.motor_drive.signals import TorqueScale, load_accuracy, low_passed, without_level
 from kros.observer import Observer, Recordings, identify_estimator, relift_certificate, run_observer
 from kros.observer.residual import one_step_residual, one_step_rows
 from kros.plants import HarmonicDrivePopulation

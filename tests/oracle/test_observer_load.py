@@ -11,7 +11,8 @@ from load_baselines import ripple_power
 from kros.core.errors import DataError, DimensionError
 from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad
-from kros.motor_drive.signals import LoadSettings, TorqueScale, known_load, load_accuracy, load_observer, without_level
+from kros.motor_drive.observer import LoadSettings, load_observer
+from kros.motor_drive.signals import TorqueScale, known_load, load_accuracy, without_level
 from kros.observer import ReliftScales, run_observer
 from kros.observer.estimator.certificate import filter_certificate
 from kros.plants import HarmonicDrivePopulation

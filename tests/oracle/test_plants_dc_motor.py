@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from kros.plants import DcMotorPopulation
-from kros.plants.small_plants import DcMotorTruth
+from kros.plants.dc_motor import DcMotorTruth
 
 
 def motors(units=3, **settings):

@@ -1,7 +1,7 @@
 """Load torque: from the error of a recorded current, or by observers with the load as a state.
 
-`signals` computes what a mounted load does and which part of it can be seen, makes the estimator from one known load,
-and brings back what no measurement holds.
+`signals` computes what a mounted load does and which part of it can be seen, `observer` makes the estimator from one
+known load, and `level` brings back what no measurement holds.
 
 Examples
 --------
@@ -11,7 +11,7 @@ Examples
 """
 
 from ..core import refusing
-from .signals import AngleLoad
+from .level import AngleLoad
 
 __all__ = ["AngleLoad"]
 __getattr__ = refusing(__name__)

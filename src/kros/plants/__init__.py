@@ -8,8 +8,9 @@ Examples
 """
 
 from .batch import SimulatedPopulation
+from .dc_motor import DcMotorPopulation
 from .harmonic_drive.population import HarmonicDrivePopulation
-from .small_plants import DcMotorPopulation, PendulumPopulation
+from .pendulum import PendulumPopulation
 
 PLANTS = {"harmonic-drive": HarmonicDrivePopulation, "pendulum": PendulumPopulation, "dc-motor": DcMotorPopulation}
 

@@ -20,7 +20,8 @@ from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
 from ...motor_drive import AngleLoad
-from ...motor_drive.signals import LoadSettings, TorqueScale, known_load, load_accuracy, load_observer
+from ...motor_drive.observer import LoadSettings, load_observer
+from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
 from ...observer import EstimatorSettings, Observer, run_observer
 from ..engine.context import Context
 

@@ -1,0 +1,73 @@
+"""The set as a disturbance: rational filters that shape white noise like the average over the set.
+
+The disturbance is ``W_L w2`` and acts at the input or at the state. Where W_L is diagonal one filter a channel stands
+for W_L and the spectrum of w2 together, which takes fewer states; a full W_L stays as it is behind one filter for every
+component of w2.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+
+import numpy as np
+
+from ...core import AnyArray, StateSpace, block_diagonal, gain
+from ...uncertainty import fit_magnitude
+from ..problem.observer_problem import ObserverProblem
+from ..problem.plants import disturbed
+from .certificate import uncertain_ball
+
+_FLOOR, _NOTHING = 1e-14, 1e-30  # relative power below which a channel is level; power of a channel that is absent
+
+
+def average_disturbance(problem: ObserverProblem, max_order: int, tolerance_db: float) -> tuple[StateSpace, StateSpace]:
+    """Return filters that shape white noise like the average over the set, at the input and at the state."""
+    freqs = design_grid(problem)
+    power = np.real(np.einsum("fii->fi", uncertain_ball(problem, freqs).average()))  # of w2
+    left, dt = np.abs(problem.W_L.frequency_response(freqs)) ** 2, problem.nominal.dt
+    of = partial(filters, freqs_hz=freqs, dt=dt, max_order=max_order, tolerance_db=tolerance_db)
+    if left.shape[1] == left.shape[2] and not left[:, ~np.eye(left.shape[1], dtype=bool)].any():
+        shaped = of(np.sum(left, axis=-1) * power)
+    else:
+        shaped = problem.W_L @ of(power)
+    rest = _remainder(problem, freqs)
+    return disturbed(problem, shaped, None if rest is None else of(rest))
+
+
+def design_grid(problem: ObserverProblem) -> AnyArray:
+    """Frequencies for the design, Hz: logarithmic from well below the slowest pole to Nyquist."""
+    dt = problem.nominal.dt
+    systems = [problem.nominal, problem.W_L, problem.W_R, problem.input_weight]
+    slowest = np.abs(np.concatenate([s.poles() for s in systems]) - 1).min(initial=1.0)
+    return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, 400) / (2 * np.pi * dt)  # 400 points
+
+
+def _remainder(problem: ObserverProblem, freqs_hz: AnyArray) -> AnyArray | None:
+    """Average spectrum of the remainder, shape (f, n)."""
+    if problem.remainder is None:
+        return None
+    left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
+    energy = np.sum(np.abs(right) ** 2, axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
+    return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
+
+
+def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, max_order: int, tolerance_db: float) -> StateSpace:
+    """Return one filter a channel, whose magnitude touches the root of its power, shape (f, channels), from above."""
+    systems = []
+    for column in power.T:
+        if column.max() <= _NOTHING:
+            systems.append(gain([[0.0]], dt))
+            continue
+        magnitude = np.sqrt(np.maximum(column, _FLOOR * column.max()))
+        shape = (magnitude / magnitude.max()).tobytes()
+        system = _fitted(freqs_hz.tobytes(), shape, dt, max_order, tolerance_db)
+        ratio = magnitude / np.abs(system.frequency_response(freqs_hz)[:, 0, 0])
+        systems.append(gain([[float(ratio.max())]], dt) @ system)
+    return block_diagonal(systems)
+
+
+@lru_cache(maxsize=100)
+def _fitted(freqs_hz: bytes, magnitude: bytes, dt: float, max_order: int, tolerance_db: float) -> StateSpace:
+    """Return the system of a fit; problems that differ in noise alone share it."""
+    values = np.frombuffer(freqs_hz), np.frombuffer(magnitude)
+    return fit_magnitude(*values, dt, max_order=max_order, tolerance_db=tolerance_db).system

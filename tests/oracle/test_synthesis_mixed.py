@@ -11,7 +11,8 @@ from drives import DT, lag, servo
 from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, h2, mixed
 from kros.synthesis.mixed_norms.barrier import minimise
-from kros.synthesis.mixed_norms.mixed import MixedInequalities, by_inequalities, scaled, truncate, verify
+from kros.synthesis.mixed_norms.inequalities import MixedInequalities
+from kros.synthesis.mixed_norms.mixed import by_inequalities, scaled, truncate, verify
 from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.worst_case.certificate import certify
 

@@ -10,7 +10,8 @@ from scipy.optimize import minimize
 
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm
 from kros.synthesis import Injection, ObserverProblem, Status, worst_case_h2
-from kros.synthesis.worst_case.certificate import Ball, certify, circle_mean, density, dual_bound, spread
+from kros.synthesis.worst_case.ball import Ball, dual_bound, spread
+from kros.synthesis.worst_case.certificate import certify, circle_mean, density
 
 
 def problem(seed=0, injection=Injection.STATE, **changes):

@@ -15,7 +15,7 @@ from ...core import AnyArray, StateSpace, block_diagonal, gain
 from ...uncertainty import fit_magnitude
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import disturbed
-from .certificate import uncertain_ball
+from .ball import uncertain_ball
 
 _FLOOR, _NOTHING = 1e-14, 1e-30  # relative power below which a channel is level; power of a channel that is absent
 

@@ -74,8 +74,13 @@ class TrainingSet:
 
     @cached_property
     def start(self) -> Array | None:
-        """The mean first state of the episodes, zero where it is measured; None where all of it is zero."""
-        first = EpisodeBatch.read(self.population, self.keys, 1).states[0].mean(axis=0)
+        """The mean first state of the episodes, zero where it is measured; None where all of it is zero.
+
+        It counts by ``1 - error^2 / mean^2``, if that is positive (James and Stein): little where signs are random.
+        """
+        values = EpisodeBatch.read(self.population, self.keys, 1).states[0]
+        mean, squared_error = values.mean(axis=0), values.var(axis=0) / len(values)
+        first = mean * np.maximum(1 - squared_error / np.maximum(mean**2, TINY), 0.0)
         first[np.isin(self.population.states, self.population.measured)] = 0.0
         return first if first.any() else None
 

@@ -216,11 +216,13 @@ def in_step(designs: Sequence[Design], recordings: Recordings, rows: int) -> Ite
 def samples(designs: Sequence[Design]) -> list[tuple[Array, Array]]:
     """Return thinned rows of the bank of every design, and weights that sum to one."""
     recordings, settings = designs[0].recordings, designs[0].settings
-    episodes = list(in_step(designs, recordings.some(settings.episodes // 2), settings.sample))
-    weights = np.concatenate([w for (*_, w), *_ in episodes])
-    return [
-        (np.vstack([rows for _, rows, *_ in of_one]), weights / weights.sum()) for of_one in zip(*episodes, strict=True)
-    ]
+    parts, weights = [list[Array]() for _ in designs], list[Array]()
+    for episode in in_step(designs, recordings.some(settings.episodes // 2), settings.sample):
+        weights.append(episode[0][-1])
+        for of_one, (_, rows, *_) in zip(parts, episode, strict=True):
+            of_one.append(rows)
+    weight = np.concatenate(weights)
+    return [(np.vstack(parts.pop(0)), weight / weight.sum()) for _ in designs]  # one design after the other: memory
 
 
 @frozen

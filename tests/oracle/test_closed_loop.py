@@ -266,3 +266,13 @@ def test_what_cannot_be_judged_is_said(motors) -> None:
 def test_a_limit_of_the_actuator_keeps_an_unstable_loop_bounded(motors) -> None:
     limited = close_loop(observer_of(motors), motors, controller(motors, 100.0, limits={"voltage": (-6.0, 6.0)}))
     assert (limited.status, limited.diverged) == ("NOT SAFE", ())
+
+
+def test_limits_are_in_the_units_of_the_recordings(motors) -> None:
+    observer = replace(observer_of(motors), about={"columns": {"voltage": {"factor": -0.001}}})
+    ends = controller(motors, 0.0, limits={"voltage": (-6.0, 12.0)}).ends(observer, ("voltage", "torque"))
+    np.testing.assert_allclose(ends, [[-0.012, -np.inf], [0.006, np.inf]])
+    assert np.all(np.isinf(controller(motors, 0.0).ends(observer, ("voltage",))))
+    for name in ("volts", "velocity"):
+        with pytest.raises(ConfigError, match=f"signal '{name}' is unknown"):
+            close_loop(observer_of(motors), motors, controller(motors, 0.0, limits={name: (-6.0, 6.0)}))

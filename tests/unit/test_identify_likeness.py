@@ -46,3 +46,11 @@ def test_moments_are_covariances_of_channels_and_changes() -> None:
     wide = np.hstack([values[1:], values[1:] - values[:-1]])
     np.testing.assert_allclose(moments(values), (wide - wide.mean(axis=0)).T @ (wide - wide.mean(axis=0)) / 49)
     assert unlike(["a", "b", "c"], ["x", "rest"], [np.diag([1.0, 0, 1, 0])] * 3) == []
+
+
+@pytest.mark.parametrize("resting", [0.0, 1e-20])
+def test_a_channel_that_rests_in_one_unit_or_in_most_has_no_unit_of_measure(resting: float) -> None:
+    moving = np.eye(4)
+    still = np.diag([1.0, resting, 1.0, resting]) ** 2
+    for units in ([moving, moving, moving, still], [moving, still, still, still]):
+        assert unlike("abcd", ["position", "brake"], units) == []

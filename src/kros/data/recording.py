@@ -31,7 +31,8 @@ class CheckRule:
     end: float = AGREED  # of a sample: how far rounding may move the end of an even grid
     samples: int = 3  # fewest: two consecutive states and one more
     wild: float = 1e3  # times the size of a channel, from which on a sample is wild
-    ratio: float = 8.0  # to the median unit, from which on the size of a channel is doubted
+    # to the median unit, from which on the size of a channel is doubted; half its logarithm beside the other channels
+    ratio: float = 8.0
     correlation: float = 0.5  # of channels, from which on its sign counts
     constant: float = ROUNDING  # of the largest value: what filters and scales make of a constant
     # sampling periods outside are usual for a time in ms or us that is taken for seconds

@@ -243,7 +243,6 @@ def calibration_keys(facts: RecordingFacts, unit: str) -> tuple[EpisodeKey, ...]
     return facts.keys("train", unit, facts.identify_on) or tuple(k for k in every if k.condition == every[0].condition)
 
 
-log = logging.getLogger(__name__)
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
 Texts = dict[str, str]  # by unit
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core import TINY, Array
+from ..core import ROUNDING, TINY, Array
 from ..data.recording import CHECK
 
 
@@ -21,10 +21,13 @@ def unlike(units: Sequence[str], channels: Sequence[str], covariances: Sequence[
     G, c = np.array(covariances), len(channels)
     size = np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), TINY))
     correlation = G / size[:, :, None] / size[:, None]
-    ratio = size[:, :c] / np.median(size[:, :c], axis=0)
+    moved = size[:, :c]
+    most = np.median(moved, axis=0)
+    ratio = moved / most
     log, far = np.log(ratio), np.log(CHECK.ratio)
     beside = log - np.median(log, axis=1, keepdims=True)  # other channels of the unit: it may have been moved less
-    apart = (np.abs(log) > far) & (np.abs(beside) > far / 2)
+    moves = np.minimum(moved, most) > ROUNDING * moved.max(axis=0)  # what rests has no unit of measure
+    apart = moves & (np.abs(log) > far) & (np.abs(beside) > far / 2)
     sure = np.abs(correlation) > CHECK.correlation
     usual = np.median(correlation, axis=0)
     opposite = sure & (np.abs(usual) > CHECK.correlation) & (correlation * usual < 0)

@@ -1,7 +1,4 @@
-"""The compiled time loops, called with arrays by name.
-
-Linear recursions of many signals.
-"""
+"""The compiled time loops and linear recursions of many signals, called with arrays by name."""
 
 from __future__ import annotations
 

@@ -65,6 +65,13 @@ class Controller(Settings):
         A, B, C, D = matrices
         return gain(write, dt) @ StateSpace(A, B, C, D, dt) @ gain(np.linalg.pinv(read), dt)
 
+    def ends(self, observer: ObserverData, known: Sequence[str]) -> Array:
+        """Return the lowest and highest value of all known inputs, in the units of the models, (2, known)."""
+        factors = self._places(observer, tuple(self.limits), known).sum(axis=0)
+        ends = np.tile([[-np.inf], [np.inf]], len(known))
+        ends[:, [known.index(name) for name in self.limits]] = np.sort(factors * np.array([*self.limits.values()]).T, 0)
+        return ends
+
     @staticmethod
     def _places(observer: ObserverData, names: Sequence[str], known: Sequence[str]) -> Array:
         """Return what the recorded value of every named signal is in all that are known, (known, names)."""

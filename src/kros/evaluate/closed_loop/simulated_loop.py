@@ -20,8 +20,7 @@ def diverging(
     values = {name: v[rows] for name, v in models.parameters.items()}
     model = np.concatenate([models.A, models.B], axis=2)[rows, : lifting.n_states]
     n, q, x, u = lifting.n_states, list(observer.measured), batch.states[0], batch.inputs[0]
-    K, limits = controller.between(observer, models), controller.limits
-    low, high = np.array([limits.get(name, (-np.inf, np.inf)) for name in models.recorded_inputs]).T
+    K, (low, high) = controller.between(observer, models), controller.ends(observer, models.recorded_inputs)
     course, xi = Course(observer, len(rows), observer.own(values)), np.zeros((len(rows), K.n_states))
     course.begin(screened(observer, x[None][..., q], u[None]))
     past, diverged = lifting.window.hold(x, u), np.zeros(len(rows), dtype=bool)

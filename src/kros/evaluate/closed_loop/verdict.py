@@ -123,7 +123,8 @@ def close_loop(
     first = [facts.keys("test", unit, models.condition)[0] for unit in covered.unit_ids]
     batch = EpisodeBatch.read(uncertain.models.population, first, samples)
     diverged = diverging(observer, models, batch, controller, largest)
-    reasons, assumed = [f"it diverges in simulation with {', '.join(diverged)}"] * bool(diverged), ASSUMPTIONS
+    reasons = [f"it diverges in simulation with {', '.join(diverged)}"] if diverged else []
+    assumed = ASSUMPTIONS
     try:
         loop, left_out = LinearLoop.of(observer, models, covered, controller.between(observer, models))
     except SynthesisError as error:

@@ -220,6 +220,6 @@ class Residuals:
         return [Descriptor.of(plant) for plant in plants if isinstance(plant, StateSpace)]
 
     def _systems(self, remainder: bool) -> list[Descriptor]:
-        """Return the systems behind these residuals, or behind what the form leaves out."""
+        """Return the systems behind these residuals, or behind what the form does not represent."""
         plants = self._plants()
         return [residual_system(self.form, plants[0], Gp, remainder) for Gp in plants[1:]]

@@ -18,7 +18,7 @@ from kros.observer import EstimatorSettings, Observer, Recordings, identify_esti
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
-from kros.observer.estimator.reduction import reduced
+from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated, samples
 
 
@@ -113,6 +113,19 @@ def test_reduced_filters_are_stable_at_every_order_and_tend_to_the_bank():
             z = filters.A @ z + filters.B @ row
         apart.append(np.sqrt(np.mean((np.array(estimates) - wanted)[:, 1:] ** 2)))
     assert apart[-1] < 0.02 * apart[0]
+
+
+def test_modes_give_the_same_estimates_with_two_multiplications_a_state_unless_they_are_alike():
+    rng = np.random.default_rng(2)
+    modes, lag = rng.normal(size=(5, 5)), np.diag([0.99, 0.9, 0.9, 0.5, -0.3])
+    lag[1, 2], lag[2, 1] = 0.3, -0.3
+    rest = rng.normal(size=(5, 2)), rng.normal(size=(3, 5)), rng.normal(size=(3, 2)), rng.normal(size=(5, 2))
+    filters = Filters(modes @ lag @ np.linalg.inv(modes), *rest, np.ones(5))
+    turned, v = filters.modal(), rng.normal(size=(300, 2, 2))
+    assert np.count_nonzero(turned.A) == 7
+    np.testing.assert_allclose(turned.along(v), filters.along(v), rtol=0, atol=1e-9)  # rounding times the condition
+    alike = replace(filters, A=np.array([[0.7, 0.2], [0.0, 0.7]]))
+    assert alike.modal() is alike
 
 
 def test_a_reduction_keeps_its_digits_where_coefficients_cancel():

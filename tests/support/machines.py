@@ -9,7 +9,6 @@ from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Seen
 from kros.observer.filter_bank import FilterBank
 from kros.observer.monitor import Monitor, octaves
-from kros.observer.units import in_coordinates
 from kros.synthesis import Injection
 
 STATES, DT = ("position", "velocity", "current"), 1e-3
@@ -62,8 +61,6 @@ MACHINES = {
     "filter bank": lambda: filters(),
     "filter bank with limits": lambda: filters(cut=True),
     "filter bank without functions": lambda: filters(()),
-    "filter bank of unequal sizes": lambda: unequal(filters()),
-    "filter bank without modes": lambda: unequal(filters(), modes=False),
     "monitor": lambda: watched(drive()),
     "monitor and delay": lambda: watched(drive(delay=2, **LIMITS)),
 }
@@ -92,15 +89,6 @@ def filters(functions=GEAR, cut=False):
     runtime = Runtime(0, low, high) if cut else Runtime()
     parts = (lifting, A, B, (0,), ("target", "rate"), none, Injection.STATE, DT, {"phase": 0.3} if functions else {})
     return Observer("filters", *parts, runtime, Seen(np.array([1.5]), np.array([2.0, 9.0])), bank=bank)
-
-
-def unequal(observer, modes=True):
-    """The same with filters of very different sizes, perhaps with two that have one mode between them."""
-    A, turn = observer.A.copy(), np.eye(observer.lifting.n_lifted)
-    if not modes:
-        A[3:5, 3:5] = [[0.7, 0.2], [0.0, 0.7]]
-    turn[3, 3], turn[4, 4] = 1e-7, 1e7
-    return in_coordinates(replace(observer, A=A), turn)
 
 
 def watched(observer, bound=1.0):

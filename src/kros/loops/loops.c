@@ -7,8 +7,14 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define WIDE 8  /* machines in a vector */
-#define MOST 4  /* vectors at a time, so that what a machine needs stays in the cache */
+#if defined __AVX512F__ /* machines in a vector of the processor: compilers handle larger ones badly */
+#define WIDE 8
+#elif defined __AVX__
+#define WIDE 4
+#else
+#define WIDE 2
+#endif
+#define MOST (32 / WIDE)  /* vectors at a time, so that what a machine needs stays in the cache */
 typedef double vec __attribute__((vector_size(WIDE * sizeof(double))));
 typedef int64_t mask __attribute__((vector_size(WIDE * sizeof(int64_t))));
 typedef int64_t whole;

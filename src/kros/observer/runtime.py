@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..core import Array, DataError, frozen
@@ -123,11 +121,6 @@ class Guard:
                 f"{what}: lower bounds {self.lower} should be below the upper ones {self.upper}, and {self.settle} "
                 "samples to settle at least 0."
             )
-
-    def turned(self, turn: Array) -> Guard:
-        """Return the smallest box around the states ``turn @ x``, shape (n, n); states of the correction stay."""
-        middle, half = turn @ (self.lower + self.upper) / 2, np.abs(turn) @ (self.upper - self.lower) / 2
-        return replace(self, lower=middle - half, upper=middle + half)
 
 
 def bounds(guard: Guard | None, n: int, order: int) -> tuple[Array, Array]:

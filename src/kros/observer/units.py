@@ -28,11 +28,11 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     x, u = factors(observer, sizes)
     y, K = x[list(observer.measured)], observer.controller
     into = u if observer.injection is Injection.INPUT else x
-    observer = in_coordinates(observer, np.diag(x))
     by: dict[str, dict[str, Array]] = {
         "seen": {"measured": y, "inputs": u[: len(observer.inputs)]},
         "monitor": {"size": y},
-        "bank": {"start": 1 / np.concatenate([x, u]), "reach": y},
+        "bank": {"start": x[: lifting.n_states, None] / np.concatenate([x, u]), "reach": y},
+        "guard": dict.fromkeys(("lower", "upper"), x[: lifting.n_states]),
         "runtime": dict.fromkeys(observer.runtime.by_state(), x[: lifting.n_states]),
     }
     parts = {name: part for name in by if (part := getattr(observer, name)) is not None}
@@ -42,22 +42,11 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     return replace(
         observer,
         lifting=lifting,
-        B=observer.B / u,
+        A=observer.A * x[:, None] / x,
+        B=observer.B * x[:, None] / u,
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
         sensor=in_units(observer.sensor, dict(zip(observer.outputs, (1 / y).tolist(), strict=True))),
         **changed,
-    )
-
-
-def in_coordinates(observer: O, turn: Array) -> O:
-    """Return the model, the bank and the guard in coordinates ``turn @ theta``, shape (n_lifted, n_lifted)."""
-    n, bank, guard = observer.lifting.n_states, observer.bank, observer.guard
-    return replace(
-        observer,
-        A=turn @ observer.A @ np.linalg.inv(turn),
-        B=turn @ observer.B,
-        bank=None if bank is None else replace(bank, start=turn[:n, :n] @ bank.start),
-        guard=None if guard is None else guard.turned(turn[:n, :n]),
     )
 
 

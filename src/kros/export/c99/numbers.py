@@ -17,8 +17,7 @@ from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ..text import plain, plain_names, require_identifier
-from .origin import OriginShift, find_shift
-from .realise import RULE, realised
+from .origin import RULE, OriginShift, find_shift
 
 TOLERANCE = {"double": 1e-9, "float": 1e-3}  # of golden vectors
 DOUBLE, SINGLE = Precision(), Precision("float")
@@ -51,7 +50,7 @@ class LoadOutput:
 class Source:
     """An observer in the terms of its C source."""
 
-    observer: Observer  # in the coordinates in which it is computed
+    observer: Observer
     name: str
     precision: Precision
     shift: OriginShift | None
@@ -70,7 +69,6 @@ class Source:
             raise ConfigError(f"Export: precision should be {' or '.join(TOLERANCE)}, found {precision!r}.")
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
             raise ConfigError(f"Export: load torque needs {', '.join(missing)}, found {', '.join(observer.recorded)}.")
-        observer = realised(observer)
         loop = None if track is None else PhaseLockedLoop(observer, track, 1)
         shift = find_shift(observer) if precision == "float" else None
         return cls(observer, name, Precision(precision), shift, loop, load)

@@ -21,7 +21,20 @@ import numpy as np
 from ...core import EPS, ITERATED, TINY, Array, frozen
 from ...lifting import Lifting
 from ...observer.data import ObserverData
-from .realise import RULE
+
+
+@frozen
+class ExportRule:
+    """How the origin of single precision moves; estimates stay the same."""
+
+    whole: float = 0.01  # factors as near to a whole number are whole: their difference is exact
+    far: int = 8  # periods from the origin, as far as single precision goes
+    rounding: float = 5e4 * EPS  # of the largest term of a direction
+    periods: int = 60  # of the first function at most, until all others repeat
+    static: float = 0.01  # of the largest measurement: the step of the origin where no function repeats
+
+
+RULE = ExportRule()
 
 
 @frozen

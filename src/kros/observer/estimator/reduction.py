@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import EPS, Array, frozen
-from ...core.linalg import balanced_size
+from ...core.linalg import balanced_size, qr_triangle
 from ...core.norms import gramian_root
 from ...loops import recursion
 from .channels import Channels
@@ -94,7 +94,7 @@ def reduced(readout: Readout, fine: tuple[Array, Array], order: int | None = Non
     _, values, U = np.linalg.svd(root, full_matrices=False)
     kept = values > EPS * values[0]
     L, inverse = values[kept, None] * U[kept], U[kept].T / values[kept]
-    _, sigma, V = np.linalg.svd((X / size * np.sqrt(w)[:, None]) @ L.T, full_matrices=False)
+    _, sigma, V = np.linalg.svd(qr_triangle((X / size * np.sqrt(w)[:, None]) @ L.T))
     scale = np.maximum(sigma, EPS * sigma[0])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
     whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)

@@ -31,7 +31,7 @@ def episode(samples: int, lifted: int) -> Work:
 
 
 def models(units: int, lifted: int) -> Work:
-    R = np.stack([reduce_episode(*problems.recording(400, seed % 8), problems.wide(lifted)).R for seed in range(units)])
+    R = np.stack([reduce_episode(*problems.recording(400, seed % 8), problems.wide(lifted)).R for seed in range(units)])  # type: ignore[call-arg]
     return lambda: edmd(R, lifted, 90.0)
 
 

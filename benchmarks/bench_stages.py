@@ -139,7 +139,7 @@ def predictions() -> Stage:
             lambda: [plain.free_run(found.A, found.B, lift, x0[i], inputs[i]) for i in range(4)], share=4 / 200
         ),
     }
-    ours = Entry(lambda: free_run(*batch, QUADRATIC, {}, x0, inputs))
+    ours = Entry(lambda: free_run(*batch, QUADRATIC, {}, x0, inputs))  # type: ignore[call-arg]
     return Stage("200 episodes of 500 samples, 9 lifted states", {"kros": lambda: ours, **others})
 
 

@@ -21,6 +21,7 @@ from kros.data import EpisodeBatch
 from kros.evaluate.closed_loop import Controller, close_loop
 from kros.evaluate.closed_loop.linear_loop import LinearLoop
 from kros.evaluate.closed_loop.simulated_loop import diverging
+from kros.identify import ModelSet
 from kros.observer import Observer
 from kros.synthesis.generalized_plant import interconnect
 from kros.uncertainty.quantify import UncertainModels
@@ -28,7 +29,7 @@ from kros.uncertainty.quantify import UncertainModels
 VERDICT, SAMPLES, MEMBERS, LARGEST = 1000, 5000, 20, 100.0
 
 
-def drawn(rng: np.random.Generator, models: object) -> Controller:
+def drawn(rng: np.random.Generator, models: ModelSet) -> Controller:
     """Return a random controller of order 0 to 2 on some estimates and inputs, its gain over six decades."""
     states, inputs, order = models.lifting.states, models.recorded_inputs, int(rng.integers(3))
     read = sorted(rng.choice(states, int(rng.integers(1, len(states) + 1)), replace=False))
@@ -53,7 +54,7 @@ def unstable_members(rng: np.random.Generator, loop: LinearLoop) -> int:
         deltas = []
         for rows, columns in blocks.sizes[:-1]:
             pole, parts = rng.uniform(-0.9, 0.999), [(1, columns), (rows, 1), (rows, columns)]
-            one = StateSpace([[pole]], *(rng.normal(size=shape) for shape in parts), dt)
+            one = StateSpace([[pole]], *(rng.normal(size=shape) for shape in parts), dt)  # type: ignore[call-arg]
             size = hinf_norm(one) * (1 + 1e-6)
             deltas.append(replace(one, C=one.C / size, D=one.D / size))
         systems = {"M": blocks.system, "Delta": block_diagonal(deltas)}

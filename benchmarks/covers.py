@@ -23,9 +23,10 @@ import numpy.typing as npt
 import kros
 from kros.core import StateSpace
 from kros.core.frequency import log_grid, nyquist_hz
+from kros.data import write_parquet
 from kros.identify import ModelSet
+from kros.plants import HarmonicDrivePopulation
 from kros.study import validate_config
-from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.uncertainty import Form, UncertainModel, quantify
 from kros.uncertainty.weights.cover import Weight
@@ -65,10 +66,8 @@ def models_of(place: Path, population: str, units: int) -> Path:
     loop, seed, spread = population.split(":")
     folder = place / f"pop_{loop}_{seed}_{spread}"
     if not (folder / "run" / "models").exists():
-        simulate_to(
-            folder / "recordings",
-            Simulation(units, 10, 20.0, int(seed), spread=float(spread), outlier=False, loop=loop),
-        )
+        drives = HarmonicDrivePopulation(units, 10, 20.0, int(seed), spread=float(spread), outlier=False, loop=loop)
+        write_parquet(drives.simulate().population, folder / "recordings")
         raw = {"data": {"source": str(folder / "recordings"), "reader": "parquet"}, "identify": {"refine": True}}
         kros.run(validate_config(raw, folder), folder / "run", until=Stage.IDENTIFY, workers=2)
     return folder / "run" / "models"

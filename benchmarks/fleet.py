@@ -85,7 +85,9 @@ def simulate(folder: Path, units: int, seconds: float) -> None:
         whole: Population = replace(
             made, units=own, episodes=tuple(keys), source=lambda key, keys=keys, made=made: made.source(keys[key])
         )
-        records += [write_group(whole, *group[:2], folder) for group in whole.groups()]
+        for unit, condition, keys in whole.groups():
+            episodes = ((key, whole.read(key), "") for key in keys)
+            records.append(write_group(whole.select([unit], [condition]), folder, episodes))
         names += own
     write_index(replace(whole, units=names), records, folder)
 
@@ -100,8 +102,8 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
     from kros.identify.presets import resolve_lifting, resolve_phase
     from kros.identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
     from kros.identify.survey import survey
+    from kros.uncertainty import choose_nominal
     from kros.uncertainty.outliers.population import score_population
-    from kros.uncertainty.quantify import choose_unit
     from kros.uncertainty.settings import QuantifySettings
 
     times: Times = {}
@@ -129,15 +131,16 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
     with stage("read"):
         population, facts = survey(population)
     with stage("calibrate"):
-        calibration = calibrate(population, facts, spec)
+        calibration = calibrate(population, facts, spec, Work())
     with stage("identify"):
         base = IdentifiedModels(population, facts, lifting, calibration)
         models = with_models(base, IdentifySettings(refine=refine), Work())
     with stage("outliers"):
-        _, scores = score_population(models, settings)
+        _, scores = score_population(models, settings, Work())
     with stage("nominal"):
         first = models.models()
-        nominal = choose_unit(first, list(first.unit_ids), settings)
+        responses = first.scaled_responses(first.frequencies(POINTS), list(first.unit_ids))
+        nominal = first.unit_ids[choose_nominal(responses, settings.form).index]
     with stage("weights"):
         units_of = {"unit_ids": list(first.unit_ids), "nominal": nominal, "max_order": ORDER}
         found = kros.quantify(first, settings.form, first.frequencies(POINTS), **units_of)

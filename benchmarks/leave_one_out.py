@@ -205,7 +205,8 @@ def numbers(cell: ErrorCell | None) -> str:
         return f"{'-':>45s}"
     if cell.mean is None:
         return f"{'diverged':>45s}"
-    band = f"{cell.band_db:8.1f}" if cell.band_db is not None else f"{'-':>8s}"
+    power = getattr(cell, "band_db", None)
+    band = f"{power:8.1f}" if power is not None else f"{'-':>8s}"
     return f"{cell.mean:8.4f} {'({:.4f}, {:.4f})'.format(*cell.interval):>18s} {cell.worst:8.4f} {band}"
 
 
@@ -223,7 +224,7 @@ def markdown(tables: list[ErrorTable], facts: Facts, folds: int) -> list[str]:
         row = [f"`{name}`{made}", "/".join(map(str, own["orders"])) or "–"]
         row += ["–" if own[key] is None else f"{own[key]}/{folds}" for key in ("relift_certified", "robust")]
         row += [rounded(table.cells[name].get(channel)) for table, channel in places]
-        bands = [cells[c].band_db if c in cells else None for c in HIDDEN]
+        bands = [getattr(cells.get(c), "band_db", None) for c in HIDDEN]
         row += ["–" if b is None else minus(f"{b:.1f}") for b in bands]
         lines.append(f"| {' | '.join(row)} |")
     return lines

@@ -25,13 +25,14 @@ import kros
 from kros.core import KrosError, gain
 from kros.core.artifacts import read_json
 from kros.core.work import Work
+from kros.data import write_parquet
 from kros.design.methods.gains import OpenLoop
 from kros.design.methods.robust import Mixed
 from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
 from kros.design.validation import percent_of
+from kros.plants import HarmonicDrivePopulation
 from kros.study import validate_config
-from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -74,7 +75,8 @@ def populations(root: Path, options: argparse.Namespace) -> Iterator[tuple[str, 
         label = f"{loop}-{seed}" + ("-refined" if options.refine else "")
         out, recordings = root / label, root / label / "recordings"
         if not (out / "run" / "metrics.json").exists():
-            simulate_to(recordings, Simulation(options.units, options.episodes, 20.0, seed, loop=loop))
+            drives = HarmonicDrivePopulation(options.units, options.episodes, 20.0, seed, loop=loop)
+            write_parquet(drives.simulate().population, recordings)
             config = validate_config(
                 {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": options.refine}}, root
             )

@@ -139,7 +139,7 @@ def factors_of(seed: int, options: argparse.Namespace) -> dict[str, Any]:
         np.savez(path, **simulate(seed, options.episodes, options.seconds))
     with np.load(path) as stored:
         found = dict(stored)
-    found["phases"] = [UnitPhase(*row[:3], int(row[3])) for row in found["phases"]]
+    found["phases"] = [UnitPhase(*row[:3], int(row[3])) for row in found["phases"]]  # type: ignore[call-arg]
     return found
 
 

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import kros
+from kros.data import write_parquet
+from kros.plants import HarmonicDrivePopulation
 from kros.study import validate_config
-from kros.study.commands.demo import Simulation, simulate_to
 
 PLANTED = "000000"
 
@@ -44,7 +45,8 @@ def main() -> None:
 def study(folder: Path, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     """Simulate one population, run the study, return the facts."""
     recordings = folder / "recordings"
-    simulate_to(recordings, Simulation(12, 10, 20.0, seed, spread=options.spread, loop=options.loop))
+    drives = HarmonicDrivePopulation(12, 10, 20.0, seed, spread=options.spread, loop=options.loop)
+    write_parquet(drives.simulate().population, recordings)
     if options.hide:
         hide(recordings)
     config = validate_config({"name": "population", "data": {"source": str(recordings), "reader": "parquet"}}, folder)

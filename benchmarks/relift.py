@@ -24,14 +24,14 @@ import numpy as np
 import kros
 from kros.core.artifacts import read_json, write_json
 from kros.core.work import Work
-from kros.data import EpisodeBatch
+from kros.data import EpisodeBatch, write_parquet
 from kros.data.readers.parquet import read_parquet
 from kros.design.methods import methods_of
 from kros.design.synthesize import _design, tasks_of
 from kros.observer import Observer, ReliftScales, relift_certificate
 from kros.observer.residual import one_step_residual
+from kros.plants import HarmonicDrivePopulation
 from kros.study import validate_config
-from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -91,10 +91,9 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
     recordings, run = folder / "recordings", folder / "run"
     if not (run / "observers" / "made.json").exists():
         shutil.rmtree(folder, ignore_errors=True)
-        simulate_to(
-            recordings,
-            Simulation(options.units, options.episodes, options.seconds, seed, spread=spread, outlier=False, loop=loop),
-        )
+        sizes = options.units, options.episodes, options.seconds, seed
+        drives = HarmonicDrivePopulation(*sizes, spread=spread, outlier=False, loop=loop)
+        write_parquet(drives.simulate().population, recordings)
         config = validate_config({**STUDY, "data": {"source": str(recordings.absolute()), "reader": "parquet"}}, folder)
         kros.run(config, run, until=Stage.QUANTIFY, workers=options.workers)
         with open_executor(options.workers) as executor:

@@ -19,7 +19,7 @@ import numpy as np
 
 import kros
 from kros.core.errors import SynthesisError
-from kros.data import EpisodeBatch
+from kros.data import EpisodeBatch, write_parquet
 from kros.design.baselines import make_learned
 from kros.design.methods import methods_of
 from kros.design.synthesize import tasks_of
@@ -29,7 +29,7 @@ from kros.evaluate.sensor import as_shown
 from kros.identify.calibration import segments_of
 from kros.observer import Sensor, run_observer
 from kros.observer.units import in_sizes
-from kros.study.commands.demo import Simulation, simulate_to
+from kros.plants import HarmonicDrivePopulation
 from kros.uncertainty.quantify import UncertainModels
 
 HIDDEN = (1, 2)
@@ -49,7 +49,8 @@ def sensors(size: float, step: float) -> dict[str, dict[str, float]]:
 def prepared(folder: Path, loop: str, seed: int) -> tuple[UncertainModels, Any, list[str]]:
     """Return the uncertain models of eight units, the recordings of all and the names of the others."""
     if not (folder / "recordings").exists():
-        simulate_to(folder / "recordings", Simulation(12, 6, 12.0, seed, spread=3.0, outlier=False, loop=loop))
+        drives = HarmonicDrivePopulation(12, 6, 12.0, seed, spread=3.0, outlier=False, loop=loop)
+        write_parquet(drives.simulate().population, folder / "recordings")
     population = kros.read(folder / "recordings")
     units = [u.id for u in population.units]
     if not (folder / "uncertain").exists():
@@ -82,7 +83,9 @@ def designs(uncertain: UncertainModels, sensor: dict[str, Sensor]) -> dict[str, 
             )  # type: ignore[misc]
     models = uncertain.models
     learned = make_learned(TrainingSet.whole(models, models.models(), sensor), models.models().measured)
-    return found | {"learned": lambda b: learned.run(b, b.parameters)}
+    return found | {
+        "learned": lambda b: learned.estimate(b.keys, b.measurements(learned.measured), b.inputs, b.parameters)
+    }
 
 
 def main() -> None:

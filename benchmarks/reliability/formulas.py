@@ -23,7 +23,7 @@ from campaign import LONGEST_S, Tally, main
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting
 from kros.lifting.families import check_family
-from kros.lifting.program import c_code
+from kros.lifting.program import Precision, c_code
 
 DIGITS, NAMES = 60, ("x", "y", "p")
 BOX = {"x": (-1.5, 2.0), "y": (0.3, 1.1), "p": (-0.4, 0.4)}
@@ -227,7 +227,7 @@ def one(text: Any, tally: Tally, rng: np.random.Generator) -> None:
             lifting = Lifting(("x", "y"), (text,), ("p",))
             outcome = "accepted, in agreement"
             if not lifting.history:
-                [c_code(formula.expression, str) for formula in lifting.formulas]
+                [c_code(formula.expression, str, Precision()) for formula in lifting.formulas]
                 with suppress(ConfigError):  # a parameter that does not separate
                     _ = lifting.separation
                 wrong = judge_slopes(lifting, rng)

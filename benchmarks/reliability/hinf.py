@@ -142,7 +142,7 @@ def controllers(p: GeneralizedPlant, level: float) -> Iterator[StateSpace]:
         routine = slycot.sb10dd if p.dt > 0 else slycot.sb10fd
         try:
             out = routine(n, n_w + n_u, n_z + n_y, n_u, n_y, level, s.A, s.B, s.C, s.D, 1e-14)
-            yield StateSpace(*[x for x in out if np.ndim(x) == 2][:4], p.dt)
+            yield StateSpace(*[x for x in out if np.ndim(x) == 2][:4], p.dt)  # type: ignore[call-arg]
         except (ArithmeticError, ValueError):
             return
 
@@ -152,16 +152,16 @@ def attained(p: GeneralizedPlant, own: StateSpace, value: float) -> tuple[float,
 
     Controllers of plants with more noise and penalty are tried too: where those are tiny, SLICOT fails on the plant itself.
     """
-    mine = norm(*closed_loop(p, own), p.dt)
+    mine = norm(*closed_loop(p, own), p.dt)  # type: ignore[call-arg]
     best = mine
     for calmer in (1.0, 30.0) if SLYCOT else ():
         easier = replace(p, D12=calmer * p.D12, D21=calmer * p.D21)
         for share in LEVELS:
             for K in controllers(easier, share * value):
-                best = min(best, norm(*closed_loop(p, K), p.dt, below=best))
+                best = min(best, norm(*closed_loop(p, K), p.dt, below=best))  # type: ignore[call-arg]
     for tolerance in () if SLYCOT else (0.3, 0.005):
         try:
-            best = min(best, norm(*closed_loop(p, hinf(p, tolerance=tolerance).controller), p.dt))
+            best = min(best, norm(*closed_loop(p, hinf(p, tolerance=tolerance).controller), p.dt))  # type: ignore[call-arg]
         except KrosError:
             continue
     return mine, best

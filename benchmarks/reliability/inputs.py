@@ -24,16 +24,7 @@ from typing import Any
 import numpy as np
 from campaign import Tally, main
 
-from kros.core.artifacts import (
-    CHECKSUM,
-    Artefact,
-    load_artifact,
-    plain,
-    read_json,
-    read_manifest,
-    save_artifact,
-    write_manifest,
-)
+from kros.core.artifacts import CHECKSUM, load_artifact, plain, read_json, save_artifact
 from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
 from kros.data import Channel, Role, from_arrays, from_frame, read, write_parquet
@@ -42,6 +33,7 @@ from kros.identify import ModelSet
 from kros.interop import from_pykoop
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
+from kros.report.manifest import Artefact, read_manifest, write_manifest
 from kros.study.config import load_config, stored_config
 from kros.synthesis.result import Injection, Status, Synthesis
 from kros.uncertainty import OutlierModel, UncertainModel, quantify, score_outliers

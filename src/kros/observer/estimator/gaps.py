@@ -89,15 +89,18 @@ def with_gaps(
     several = {name: np.tile(values, len(tried)) for name, values in own.items()}
     estimates = recorded_estimates(replace(trial, bank=side), shown, u, several)
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(halves, recoveries))
-    truth, lost = np.tile(states, (1, len(tried), 1)), np.tile(missing, (1, len(tried)))
-    every = blended_errors(truth, estimates[..., :n], estimates[..., n:], lost, forget, T, mu)
+    some = hidden or at
+    truth, lost = np.tile(states[..., some], (1, len(tried), 1)), np.tile(missing, (1, len(tried)))
+    filtered, fallback = (np.ascontiguousarray(part[..., some]) for part in (estimates[..., :n], estimates[..., n:]))
+    every = blended_errors(truth, filtered, fallback, lost, forget[some], T, mu)
     least, best = np.full(batch, np.inf), bank
     for age, errors in zip(tried, np.split(every, len(tried), axis=1), strict=True):
         choice = earliest(errors, T[:, 0], settings.margin)
-        score = errors[choice, :, range(n)][hidden or at].mean(axis=0)
+        score = errors[choice, :, range(len(some))].mean(axis=0)
         if age == tried[0] or is_less(score, least, settings.margin):
             half, recovery = np.full(n, age), np.zeros(n)
-            half[hidden], recovery[hidden] = T[choice[hidden], 0], mu[choice[hidden], 0]
+            if hidden:
+                half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
             least, best = score, replace(bank, forget=forget, half=half, recovery=recovery)
     return best
 

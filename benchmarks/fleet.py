@@ -63,8 +63,9 @@ def main() -> None:
 def simulate(folder: Path, units: int, seconds: float) -> None:
     """Write recordings of drives; every block of them is drawn from a seed of its own."""
     from kros.core.artifacts import read_json
-    from kros.data.population import EpisodeKey, Population, Unit
+    from kros.data import EpisodeKey, Unit, from_arrays
     from kros.data.readers.parquet import write_group, write_index
+    from kros.data.recording import usable_episodes
     from kros.plants import HarmonicDrivePopulation
 
     if (folder / "population.json").exists() and len(read_json(folder / "population.json")["units"]) == units:
@@ -81,13 +82,11 @@ def simulate(folder: Path, units: int, seconds: float) -> None:
         )
         own = tuple(Unit(f"{block + k + 1:06d}", "population") for k in range(count))
         renamed = dict(zip(made.unit_ids, own, strict=True))
-        keys = {EpisodeKey(renamed[k.unit].id, k.condition, k.episode): k for k in made.episodes}
-        whole: Population = replace(
-            made, units=own, episodes=tuple(keys), source=lambda key, keys=keys, made=made: made.source(keys[key])
-        )
-        for unit, condition, keys in whole.groups():
-            episodes = ((key, whole.read(key), "") for key in keys)
-            records.append(write_group(whole.select([unit], [condition]), folder, episodes))
+        data = {EpisodeKey(renamed[k.unit].id, k.condition, k.episode): made.read(k) for k in made.episodes}
+        whole = from_arrays(data, made.channels, made.sample_period_s, units=own, metadata=made.metadata)
+        for unit, condition, _ in whole.groups():
+            group = whole.select([unit], [condition])
+            records.append(write_group(group, folder, usable_episodes(group)))
         names += own
     write_index(replace(whole, units=names), records, folder)
 

@@ -48,11 +48,9 @@ def _draws(keys: Sequence[EpisodeKey], n_samples: int, seed: Sequence[int]) -> t
 
 def _late(y: Array, behind: Array) -> Array:
     """Delayed values of signals, (n_samples, batch), on a line between samples."""
-    at = np.clip(np.arange(len(y))[:, None] - behind, 0, len(y) - 1)
-    low = np.floor(at).astype(int)
-    share = at - low
-    value, following = (np.take_along_axis(y, np.minimum(at, len(y) - 1), axis=0) for at in (low, low + 1))
-    return np.where(share > 0, value + share * (following - value), value)
+    k = np.arange(len(y))
+    columns = zip((k[:, None] - behind).T, y.T, strict=True)
+    return np.stack([np.interp(at, k, column) for at, column in columns], axis=1)
 
 
 @frozen

@@ -51,7 +51,7 @@ def h2_violations(plant: GeneralizedPlant, proper: bool) -> dict[tuple[str, str]
     for (A, B, _, D), reached, regular in zip(sides, REACHED, REGULAR, strict=True):
         if modes := unreachable_modes(A, B, p.dt):
             failed[reached] = f"mode {modes[0]:.6g}"
-        if (rank := _rank(D)) < D.shape[1]:
+        if (rank := int(np.linalg.matrix_rank(D, rtol=ITERATED))) < D.shape[1]:
             failed[regular] = f"rank {rank} of {D.shape[1]}"
     if proper and p.dt == 0 and np.any(p.D11):
         failed[PROPER] = f"largest entry {np.abs(p.D11).max():.3g}"
@@ -77,11 +77,6 @@ def require_detectable(A: AnyArray, C: AnyArray, dt: float, method: str) -> None
     if modes:
         problem = f"mode {modes[0]:.6g} is on or outside the unit circle and invisible in y"
         raise SynthesisError(f"{method}: (A, C) is not detectable, {problem}; measure another state.")
-
-
-def _rank(matrix: AnyArray) -> int:
-    values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.zeros(0)
-    return int(np.sum(values > ITERATED * max(values.max(initial=0.0), TINY)))
 
 
 def _boundary_zeros(A: AnyArray, B: AnyArray, C: AnyArray, D: AnyArray, dt: float) -> list[complex]:

@@ -5,7 +5,7 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting, delays, harmonics, kmeans_centres, polynomials, radial
-from kros.lifting.families import family, number
+from kros.lifting.families import check_family, family, number
 
 STATES = ("position", "velocity", "current")
 RNG = np.random.default_rng(0)
@@ -78,6 +78,10 @@ def test_delays():
     assert delays(["position", "voltage"], 2) == ("position[-1]", "voltage[-1]", "position[-2]", "voltage[-2]")
 
 
+def clustered(names=("a",), n=3, seed=0):
+    return {"kind": "radial", "names": names, "centres": {"kind": "kmeans", "n": n, "seed": seed}, "length": 1}
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
@@ -113,6 +117,9 @@ def test_delays():
             "data: missing",
         ),
         (lambda: family({"kind": "radial", "names": ["a"], "centres": "here", "length": 1}), "could not convert"),
+        (lambda: check_family(clustered(names=3)), "names: input should be a valid tuple"),
+        (lambda: check_family(clustered(seed=-1)), "seed: .* equal to 0"),
+        (lambda: radial(["a"], [[10**400]], 1.0), "too large"),
         (lambda: Lifting(("a",), polynomials(["a", "b"], 2)), "unknown name 'b'"),
         (lambda: Lifting(("a",), ("+".join(["sin(1.2345678*a)"] * 200),)), "at most 2000"),
     ],
@@ -132,4 +139,4 @@ def test_families_as_tables():
         return np.array([[0.0], [0.0], [1.0], [1.0]])
 
     found = family({**table, "centres": {"kind": "kmeans", "n": 2, "seed": 0}}, sample)
-    assert (set(found), asked) == (set(radial(["position"], [[0], [1]], 0.5)), [["position"]])
+    assert (set(found), asked) == (set(radial(["position"], [[0], [1]], 0.5)), [("position",)])

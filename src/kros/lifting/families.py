@@ -130,7 +130,7 @@ def radial(names: Names, centres: Any, length: Lengths) -> Formulas:
 
 
 @checked
-def kmeans_centres(data: Any, n: Count, seed: int, starts: Count = 8) -> Array:
+def kmeans_centres(data: Any, n: Count, seed: Annotated[int, Field(ge=0)], starts: Count = 8) -> Array:
     """Return the means of n clusters, shape (n, d), of data (n_samples, d), the best of some starts.
 
     Distances count in units of standard deviations.
@@ -143,10 +143,16 @@ def kmeans_centres(data: Any, n: Count, seed: int, starts: Count = 8) -> Array:
 
     data = _finite("kmeans_centres: data", data)
     spread = np.where(np.ptp(data, axis=0) > 0, data.std(axis=0), 1.0)
-    means, _ = kmeans(data / spread, n, iter=starts, rng=np.random.default_rng(seed))
+    means, _ = kmeans(data / spread, int(n), iter=starts, rng=np.random.default_rng(seed))
     if len(means) < n:
         raise ConfigError(f"kmeans_centres: the data have {len(means)} clusters, not {n}; ask for fewer.")
     return means * spread
+
+
+@checked
+def quantities(names: Names) -> Formulas:
+    """Return names that radial functions can have."""
+    return names
 
 
 KINDS: dict[str, Callable[..., Any]] = {
@@ -163,7 +169,7 @@ def family(table: Mapping[str, Any], sample: Callable[[Formulas], Array] | None 
     if isinstance(arguments.get("centres"), Mapping):
         centres = dict(arguments["centres"])
         if centres.get("kind") == "kmeans" and sample is not None:
-            centres["data"] = sample(arguments.get("names", ()))
+            centres["data"] = sample(quantities(arguments.get("names", ())))
         arguments["centres"] = _call("centres", {"kmeans": kmeans_centres}, centres)
     return tuple(_call("family", KINDS, arguments))
 
@@ -174,8 +180,8 @@ def check_family(table: Mapping[str, Any]) -> None:
     if isinstance(centres, Mapping) and "data" in centres:
         raise ConfigError("Lifting centres 'kmeans': unknown key 'data'; the data are those of the study.")
     count = centres.get("n", 1) if isinstance(centres, Mapping) else 1
-    rows = count if isinstance(count, int) and 0 < count <= MAX_FORMULAS else 1
-    family(table, lambda names: np.random.default_rng(0).normal(size=(rows, max(len(tuple(names)), 1))))
+    rows = int(count) if isinstance(count, int) and 0 < count <= MAX_FORMULAS else 1
+    family(table, lambda names: np.random.default_rng(0).normal(size=(rows, len(names))))
 
 
 def _call(what: str, kinds: Mapping[str, Callable[..., Any]], table: Mapping[str, Any]) -> Any:
@@ -201,7 +207,7 @@ def _finite(what: str, values: Any) -> Array:
     """Return a finite matrix."""
     try:
         matrix = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{what}: {error}.") from error
     if matrix.ndim != 2 or not np.isfinite(matrix).all():
         raise ConfigError(f"{what} should be a finite matrix, found shape {matrix.shape}.")

@@ -442,10 +442,8 @@ def population_models() -> ModelSet:
     A = np.array([[0.9, 0.1], [-0.1, 0.8]]) + 0.01 * rng.normal(size=(4, 2, 2))
     B = np.array([[0.0], [0.1]]) + 0.002 * rng.normal(size=(4, 2, 1))
     lifting = Lifting(("position", "velocity"))
-    unit = np.broadcast_to(np.eye(2), (4, 2, 2))
-    return ModelSet(
-        "linear", "c", lifting, CHANNELS, 0.01, tuple("abcd"), A, B, {}, unit, np.ones(2), np.ones(1), 1.0, ("ok",) * 4
-    )
+    scales = np.ones(2), np.ones(1)
+    return ModelSet("linear", "c", lifting, CHANNELS, 0.01, tuple("abcd"), A, B, {}, *scales, 1.0, status=("ok",) * 4)
 
 
 def artifact_targets(root: Path) -> list[Target]:

@@ -55,8 +55,8 @@ def from_pykoop(
             "correct it."
         ) from error
     widths = {x.shape[1] if x.ndim == 2 else 0 for x in arrays.values()}
-    n_states = min(widths, default=0) - 1 - n_inputs
-    if len(widths) != 1 or not isinstance(n_inputs, int | np.integer) or n_inputs < 0 or n_states < 1:
+    n_states = min(widths, default=0) - 1 - n_inputs if isinstance(n_inputs, int | np.integer) else 0
+    if len(widths) != 1 or n_states < 1 or n_inputs < 0:
         raise DataError(
             f"from_pykoop: needs arrays (n_samples, 1 + states + {n_inputs}) of one width, found widths "
             f"{sorted(widths)}; check n_inputs."

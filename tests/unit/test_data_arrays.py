@@ -151,7 +151,7 @@ def test_pykoop_refuses() -> None:
     half[4, 0] = 0.5
     with pytest.raises(DataError, match=r"should number the episodes .* found 0\.5 in row 4 of unit 0"):
         from_pykoop(half, 1, 0.1)
-    for X, n_inputs in [(koopman_array(), 3), (koopman_array()[:, 0], 1), (koopman_array(), -1)]:
+    for X, n_inputs in [(koopman_array(), 3), (koopman_array()[:, 0], 1), (koopman_array(), -1), (koopman_array(), {})]:
         with pytest.raises(DataError, match="check n_inputs"):
             from_pykoop(X, n_inputs, 0.1)
     with pytest.raises(DataError, match="check n_inputs"):

@@ -34,6 +34,7 @@ class CheckRule:
     # to the median unit, from which on the size of a channel is doubted; half its logarithm beside the other channels
     ratio: float = 8.0
     correlation: float = 0.5  # of channels, from which on its sign counts
+    held: float = 0.2  # share of an episode in which a state stays the same, from which on its sensor is doubted
     constant: float = ROUNDING  # of the largest value: what filters and scales make of a constant
     # sampling periods outside are usual for a time in ms or us that is taken for seconds
     shortest_s: float = 1e-6
@@ -203,7 +204,8 @@ def checked_blocks(parts: Iterable[Array], key: EpisodeKey, channels: Sequence[C
         first = first if count else values[:1].ravel()
         resting &= [r and len(values) > 0 and is_constant(values[:, i], first[i]) for i, r in enumerate(resting)]
         count += len(values)
-        yield values
+        if len(values):
+            yield values
     if count < CHECK.samples:
         need = f"at least {CHECK.samples} samples are needed, found {count}"
         raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")

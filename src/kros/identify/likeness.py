@@ -1,4 +1,4 @@
-"""Units whose channels are recorded otherwise than those of most: another unit of measure, or another sign."""
+"""Units and episodes with channels that are recorded otherwise than in most: in another unit, mirrored, or stuck."""
 
 from __future__ import annotations
 
@@ -14,6 +14,31 @@ def moments(values: Array) -> Array:
     """Return the covariance of channels and their changes in an episode (n_samples, c), shape (2 c, 2 c)."""
     changes = np.diff(values, axis=0)
     return np.cov(np.hstack([values[1:], changes]).T, bias=True)
+
+
+def longest_holds(values: Array) -> Array:
+    """Return the longest time that each channel of an episode (n_samples, c) stays the same while others move.
+
+    It is a share of the episode; zero where no other channel moves by half of its span meanwhile.
+    """
+    shares, far = np.zeros(values.shape[1]), np.ptp(values, axis=0) / 2
+    for i, column in enumerate(values.T):
+        ends = np.concatenate([[0], np.flatnonzero(np.diff(column)) + 1, [len(column)]])
+        longest = int(np.diff(ends).argmax())
+        part = values[ends[longest] : ends[longest + 1]]
+        if (np.ptp(part, axis=0) > far).any():
+            shares[i] = len(part) / len(values)
+    return shares
+
+
+def stuck(episodes: Sequence[str], channels: Sequence[str], shares: Array) -> list[str]:
+    """Return a sentence for every state of an episode that stays the same far longer than in most, (episodes, n)."""
+    longer = (shares > CHECK.held) & (shares > CHECK.ratio * np.median(shares, axis=0))
+    return [
+        f"{episodes[i]}: {channels[k]} stays the same for {100 * shares[i, k]:.0f} % of it while others move; leave it "
+        "out if its sensor was stuck."
+        for i, k in np.argwhere(longer).tolist()
+    ]
 
 
 def unlike(units: Sequence[str], channels: Sequence[str], covariances: Sequence[Array]) -> list[str]:

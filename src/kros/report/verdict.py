@@ -172,7 +172,11 @@ def _of_units(facts: Facts) -> Checks:
         need = f"{most['unit']} needs {number(most['needed_s'])} s, has {number(most['recorded_s'])} s"
         yield _inconclusive(short, rows), f"Record longer: {need}.", "units"
     if few := [r for r in undecided(rows) if r["status"] == "cannot tell"]:
-        yield _inconclusive(few, rows), "Score against at least 8 units in one condition.", "units"
+        yield (
+            _inconclusive(few, rows),
+            "Score against more units in one condition, at least 8, that are more alike.",
+            "units",
+        )
     remarks = [f"{r['unit']} ({r['status']})" for r in facts.get("units", []) if r.get("status", "ok") != "ok"]
     if remarks:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"

@@ -18,7 +18,7 @@ import numpy as np
 from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_mean, frozen
 from ..measures import split_header
 from ..population import EpisodeKey, Population
-from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder
+from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, part_of, read_csv_folder
 from ..readers.tables import Dialect, file_fields, read_blocks
 from ..recording import CHECK, some, usable
 from ..steps import GAP
@@ -253,7 +253,8 @@ def _examined(
         wrong |= dict.fromkeys(population.keys(unit, condition), "the only episode of its unit and condition")
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
     usable_files = {_relative(population, source, key) for key in population.episodes if key not in wrong}
-    unusable = [name for key in wrong if (name := _relative(population, source, key)) not in usable_files]
+    paths = {key: _relative(population, source, key) for key in wrong}
+    unusable = [part_of(path, key) if path in usable_files else path for key, path in paths.items()]
     mapping = mapping | _exclusion([*excluded, *unusable])
     retained = read_csv_folder(source, mapping)
     prepare, text = _resampling(population, source, good, bridged)

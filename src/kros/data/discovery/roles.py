@@ -110,8 +110,8 @@ def kind_of(name: str, unit: str = "") -> str:
 
 
 def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[int]:
-    """Return the columns that may be time, the likeliest first: called so, or increasing evenly."""
-    rising = [i for i in range(len(columns)) if all(_rises(s[i]) for s in samples)]
+    """Return the columns that may be time, the likeliest first: called so, or increasing evenly, in most samples."""
+    rising = [i for i in range(len(columns)) if samples and np.mean([_rises(s[i]) for s in samples]) > 0.5]
     called = [i for i in rising if columns[i].kind == "time"]
     other = [i for i in rising if i not in called and not all(_counts(s[i]) for s in samples)]
     steps = {i: [np.diff(s[i]) / np.median(np.diff(s[i])) for s in samples] for i in other}

@@ -74,7 +74,11 @@ class CsvMapping(Settings):
     unit: tuple[UnitMapping, ...] = Field((), description="where one file holds several units")
     time_scale: float = Field(1.0, gt=0, description="factor from the column of time to seconds")
     sample_period_s: float | None = Field(None, gt=0, description="in place of a column of time")
-    exclude: str | None = Field(None, description="regular expression; paths in which it occurs are left out")
+    exclude: str | None = Field(
+        None,
+        description="regular expression; paths in which it occurs are left out. Behind the path of a file with several "
+        "episodes stands which one, such as log.csv#unit/condition/episode",
+    )
     delimiter: str = Field(",", description="between columns; a tab is written `\\t`")
     header: bool = Field(True, description="false where the first line holds numbers; columns are then given by number")
     skip_rows: int = Field(0, ge=0, description="lines before the header, or before the first line of numbers")
@@ -290,6 +294,9 @@ def read_csv_folder(
             chosen = chosen.without(_absent(chosen, fields, optional))
         named = {name: text for name, text in match.groupdict().items() if text}
         for key, place in _episodes(path, fields, stated, named, chosen):
+            part = part_of(path.relative_to(source).as_posix(), key)
+            if place.rows is not None and chosen.exclude and re.search(chosen.exclude, part):
+                continue
             if key in places:
                 twice = f"{key} is in {places[key].path} and in {path}"
                 raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
@@ -308,6 +315,11 @@ def read_csv_folder(
     units = [Unit(unit, group) for unit, group in groups.items()]
     facts = (chosen.channels, units, chosen.sample_period_s, chosen.metadata)
     return assemble(recordings, *facts, steps=chosen.steps, scaling=chosen.scaling)
+
+
+def part_of(path: str, key: EpisodeKey) -> str:
+    """Return how `exclude` knows an episode of a file that holds several."""
+    return f"{path}#{key.unit}/{key.condition}/{key.episode}"
 
 
 def _episodes(

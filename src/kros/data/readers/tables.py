@@ -25,7 +25,7 @@ ABSENT = ("-", "--", "---", *["#DIV/0!", "#NUM!", "#REF!", "#VALUE!", "#WERT!", 
 BLOCK = 4 << 20  # bytes that Arrow parses at once; a line has to fit into two
 HEAD = 1 << 18  # bytes of a file that say how it is written, and what its columns are called
 TIMESTAMP_SCALE = 1e-6  # timestamps are read in microseconds, which doubles hold exactly
-_STAMP = r"^\s*(?P<whole>.*:\d{2})(?:[.,:](?P<fraction>\d{1,9}))?(?:Z|[+-]\d{2}:?\d{2})?\s*$"
+_STAMP = r"^\s*(?P<whole>.*?\d{1,2}:\d{2}:\d{2})(?:[.,:](?P<fraction>\d{1,9}))?\s*(?:Z|[+-]\d{2}:?\d{2})?\s*$"
 ORDERS = ("ymd", "dmy", "mdy")  # of the date in a timestamp
 
 

@@ -193,24 +193,19 @@ def verdict(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
         }
         if found:
             best = min(found, key=lambda o: found[o])
-            bounds(name, best, [p["facts"][best] for p in parts if best in p["facts"]])
+            bounds(name, best, parts)
             line(name, f"{channel}: best worst-case H2 over open loop", found[best], most, best)
 
 
-def bounds(name: str, observer: str, facts: Sequence[Mapping[str, Any]]) -> None:
-    """Print the certified bound of the units in the set over their error, least and largest, where there is one."""
-    least, most = (
-        [f[f"set_bound_to_error_{end}"] for f in facts if f.get(f"set_bound_to_error_{end}") is not None]
-        for end in ("min", "max")
-    )
-    if least:
-        line(
-            name,
-            f"{observer}: bound over error, largest",
-            max(most),
-            3.0,
-            f"{len(most)} of {len(facts)} folds, least {min(least):.3f}",
-        )
+def bounds(name: str, observer: str, parts: Sequence[Mapping[str, Any]]) -> None:
+    """Print the bound for recorded signals over the errors of units left out, least and largest, where there is one."""
+    ratios = []
+    for part in parts:
+        bound = part["facts"].get(observer, {}).get("set_bound_percent", {})
+        rows = [r for r in part["rows"] if r["observer"] == observer and bound.get(r["channel"]) and r["error_percent"]]
+        ratios += [bound[r["channel"]] / r["error_percent"] for r in rows]
+    if ratios:
+        line(name, f"{observer}: bound over error, largest", max(ratios), 3.0, f"least {min(ratios):.3f}")
 
 
 def show_sensor(name: str, parts: Sequence[Mapping[str, Any]]) -> None:

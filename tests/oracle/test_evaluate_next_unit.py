@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from kros.core.errors import DataError
 from kros.evaluate.over_units import draw_reserve, fewest_units, next_unit_bound
 
 
@@ -40,12 +39,6 @@ def test_errors_are_bounded_together_by_the_largest_scaled_one():
     assert next_unit_bound(errors, [2.0, 20.0], 0.6) == pytest.approx([6.0, 60.0])
     assert np.isinf(next_unit_bound([[1.0], [np.nan], [2.0], [3.0]], [1.0], 0.8)).all()
     assert next_unit_bound([[1.0], [np.nan], [2.0], [3.0]], [1.0], 0.6) == pytest.approx([3.0])
-
-
-@pytest.mark.parametrize("scale", [[0.0], [np.inf]])
-def test_scales_that_are_none(scale):
-    with pytest.raises(DataError, match="Bound of the next unit"):
-        next_unit_bound(np.ones((30, 1)), scale, 0.9)
 
 
 def test_the_draw_knows_places_alone_and_grows():

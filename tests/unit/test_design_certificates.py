@@ -42,9 +42,7 @@ def task() -> Any:
     lifting = Lifting(("x",), ("x**2",))
     models = SimpleNamespace(
         lifting=lifting,
-        output_scale=np.array([2.0, 4.0]),
         recorded_inputs=("u",),
-        input_scale=np.ones(1),
         parameters={"phase": np.array([0.1, 0.4])},
     )
     return SimpleNamespace(models=models)
@@ -52,18 +50,19 @@ def task() -> Any:
 
 def test_slopes_without_a_bound_get_an_operating_box(task: Any, caplog: pytest.LogCaptureFixture) -> None:
     scales = ReliftScales(np.ones(1), np.ones(1), np.ones(1))
-    found = certify_model(observer("square", "x**2", 0.01), scales, task)
-    assert found.box["x"] == (-3.0, 3.0)
+    recorded = [batch_of(np.array([[[-2.0]], [[2.0]]]), np.array([[[4.0]], [[6.0]]]), 1.0)]
+    found = certify_model(observer("square", "x**2", 0.01), scales, task, recorded)
+    assert (found.box["x"], found.box["u"]) == ((-3.0, 3.0), (3.5, 6.5))  # around the recordings, not around zero
     assert found.gain == pytest.approx(1 / (1 - 0.8 - 0.06), rel=5e-3)
     assert any("x in [-3, 3]" in text for text in found.assumptions)
-    steep = certify_model(observer("steep", "x**2", 0.1), scales, task)
+    steep = certify_model(observer("steep", "x**2", 0.1), scales, task, recorded)
     assert steep.status is ReliftStatus.UNSTABLE
     assert "steep: no certificate for the nonlinear observer" in caplog.text
 
 
 def test_global_slopes_need_no_box_and_no_phase(task: Any) -> None:
     scales = ReliftScales(np.ones(1), np.ones(1), np.ones(1))
-    found = certify_model(observer("sine", "sin(x + phase)", 0.1), scales, task)
+    found = certify_model(observer("sine", "sin(x + phase)", 0.1), scales, task, ())
     assert found.certified
     assert not found.box
     assert "any value of phase" in found.assumptions

@@ -28,8 +28,6 @@ def log_grid(
 ) -> Array:
     """Return logarithmic frequencies up to Nyquist, Hz, from the lowest that a recording of some length holds."""
     top = nyquist_hz(sample_period_s)
-    if longest_s is not None and not longest_s > 0:
-        raise ConfigError(f"Frequency grid: the longest recording has {longest_s} s; its length should be positive.")
     low = max(top * 10.0**-decades, 0.0 if longest_s is None else 1 / longest_s)
     grid = np.geomspace(min(low, top / 2), top, n_freqs)
     grid[-1] = top

@@ -45,7 +45,7 @@ class CertificateSettings:
 
     samples: int = 5_000  # of an episode, at most
     losses: int = 12  # patterns of lost measurements that are simulated; in the first one they stop
-    box: float = 1.5  # operating box in ranges, where slopes of a lifting have no global bounds
+    box: float = 1.5  # operating box around the recordings, in their ranges, where slopes have no global bounds
     room: float = 1.0  # by which estimates may leave what they and the recordings were in training, in ranges
     largest: float = 2.0  # most that an estimate may be where measurements are lost, of the largest value in training
 
@@ -97,7 +97,7 @@ def _model_parts(observers: Sequence[Observer], batches: Sequence[EpisodeBatch],
     recorded = batches[0].states, batches[0].inputs, first.own(batches[0].parameters)
     for observer, guard in zip(observers, guards_of(observers, batches), strict=True):
         residual = one_step_residual(first.lifting, observer.A, observer.B, *recorded)
-        certificate = certify_model(observer, ReliftScales.typical(sizes, residual, task.noise), task)
+        certificate = certify_model(observer, ReliftScales.typical(sizes, residual, task.noise), task, batches)
         bound = signal_bound(certificate, observer, batches[0])
         yield guard, certificate.in_units(observer), bound
 
@@ -121,7 +121,7 @@ def _facts(certificate: ReliftCertificate, bound: SignalBound, observer: Observe
     """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
     facts: Record = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
     facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
-    facts |= bound.facts(observer.measured) | {"assumptions": certificate.assumptions}
+    facts |= bound.facts() | {"assumptions": certificate.assumptions}
     recorded = bound.cover * factors(observer, {})[0][: len(bound.states)]
     cover = zip(bound.states, recorded.tolist(), strict=True)
     facts["set_bound"] = {state: value if np.isfinite(value) else None for state, value in cover}
@@ -149,13 +149,17 @@ def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch) -> Ar
     return np.where(np.isfinite(errors), 100 * errors, np.inf)
 
 
-def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask) -> ReliftCertificate:
-    """Certify one observer everywhere, or in an operating box where slopes have no global bound."""
+def certify_model(
+    observer: Observer, scales: ReliftScales, task: DesignTask, batches: Sequence[EpisodeBatch]
+) -> ReliftCertificate:
+    """Certify one observer everywhere, or where slopes have no global bound in an operating box around recordings."""
     certificate, models = relift_certificate(observer, scales=scales), task.models
     if certificate.status is ReliftStatus.UNBOUNDED:
-        ranges = dict(zip(models.lifting.states, models.output_scale, strict=False))
-        ranges |= dict(zip(models.recorded_inputs, models.input_scale, strict=False))
-        box = {name: (-DEFAULT.box * value, DEFAULT.box * value) for name, value in ranges.items()}
+        signals = [np.concatenate([b.states, b.inputs], axis=-1)[b.inside] for b in batches]
+        low, high = (end([end(part, axis=0) for part in signals], axis=0) for end in (np.min, np.max))
+        middle, half = (low + high) / 2, DEFAULT.box * (high - low) / 2
+        ends = zip((middle - half).tolist(), (middle + half).tolist(), strict=True)
+        box = dict(zip((*observer.recorded, *models.recorded_inputs), ends, strict=True))
         values = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
         certificate = relift_certificate(observer, box, scales, values)
     if not certificate.certified:

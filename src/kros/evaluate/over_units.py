@@ -90,8 +90,6 @@ def fewest_units(confidence: float) -> int:
 def next_unit_bound(errors: ArrayLike, scale: ArrayLike, confidence: float = 0.95) -> Array | None:
     """Bound the errors of the next unit, (k,), all of them together; None with fewer units than `fewest_units`."""
     errors, scale = np.asarray(errors, dtype=float), np.asarray(scale, dtype=float)
-    if not (np.isfinite(scale) & (scale > 0)).all():
-        raise DataError(f"Bound of the next unit: a scale is positive and finite, found {scale.tolist()}.")
     if len(errors) < fewest_units(confidence):
         return None
     scores = np.max(np.where(np.isfinite(errors), errors, np.inf) / scale, axis=1)

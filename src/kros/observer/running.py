@@ -12,7 +12,7 @@ import numpy as np
 from ..core import AnyArray, Array, ArrayLike, DimensionError, Names
 from .data import ObserverData
 from .monitor import Watch
-from .screen import LONGEST, Held, SampleStatus, Screen, Screened
+from .screen import Held, SampleStatus, Screen, Screened
 from .simulate import Course, stepped
 from .step import forward
 from .tracking import PhaseLockedLoop
@@ -167,7 +167,7 @@ class RunningObserver:
         """
         course, watch, bank = self._course, self._watch, self.observer.bank
         sample = self._sample(y, u, course.held)
-        if self._fresh and not (sample.held.since > LONGEST).any():  # it was started at this sample
+        if self._fresh and not (sample.held.since > self._screen.longest).any():  # it was started at this sample
             starts = sample.starts & (bank is not None)
             sample = replace(sample, starts=starts, held=replace(sample.held, stale=np.zeros(1, dtype=bool)))
         self._fresh = False

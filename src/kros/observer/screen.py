@@ -35,7 +35,8 @@ from .runtime import Seen
 
 BEYOND = 1.5  # times the range: what is further away is implausible
 _SIGNALS = ("y", "u", "status", "starts", "complete")
-LONGEST = 5  # samples for which an input may be held without a new start
+LONGEST = 5  # samples for which an input may be held without a new start, except in filter banks, which forget it
+NEVER = 2**32 - 1  # samples since an input that was never known
 
 
 class SampleStatus(IntFlag):
@@ -84,7 +85,7 @@ class Held:
     @classmethod
     def nothing(cls, batch: int, m: int) -> Held:
         """Return what is known before the first sample."""
-        return cls(np.zeros((batch, m)), np.full((batch, m), LONGEST + 1), np.ones(batch, dtype=bool))
+        return cls(np.zeros((batch, m)), np.full((batch, m), NEVER), np.ones(batch, dtype=bool))
 
 
 @frozen
@@ -120,12 +121,14 @@ class Screen:
     least: Array
     most: Array
     q: int
+    longest: int = LONGEST
 
     @classmethod
     def of(cls, observer: ObserverData) -> Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
         sides = (side[list(observer.measured)] for side in observer.runtime.sides(observer.lifting.n_states))
-        return cls.sized(observer.seen, len(observer.measured), len(observer.inputs), *sides)
+        screen = cls.sized(observer.seen, len(observer.measured), len(observer.inputs), *sides)
+        return screen if observer.bank is None else replace(screen, longest=NEVER - 1)
 
     @classmethod
     def sized(
@@ -154,7 +157,7 @@ class Screen:
         latest = np.maximum.accumulate(np.where(good, count, 0), axis=0)
         since = np.where(latest > 0, count - latest, count + before.since)
         inputs = np.take_along_axis(np.concatenate([before.inputs[None], within[..., q:]]), latest, axis=0)
-        lost = np.asarray((since > LONGEST).any(axis=-1))
+        lost = np.asarray((since > self.longest).any(axis=-1))
         complete = np.asarray(good.all(axis=-1) & plausible[..., :q].any(axis=-1))
         starts, stale = _starts(lost, complete, before.stale)
         y = np.where(plausible, within, np.nan)[..., :q]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from enum import Enum
 
-from ..core import AGREED, StateSpace, Storable, SynthesisError, frozen, member
+from ..core import AGREED, StateSpace, Storable, SynthesisError, frozen
 
 log = logging.getLogger(__name__)
 
@@ -84,8 +84,6 @@ class Synthesis(Storable):
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, kind in (("status", Status), ("injection", Injection)):
-            object.__setattr__(self, name, member(kind, getattr(self, name), f"Synthesis {self.method}: the {name}"))
         if self.gap_percent is not None and not self.gap_percent >= 0:
             problem = f"a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %)"
             raise SynthesisError(f"Synthesis {self.method}: {problem}; please report the plant.")

@@ -17,7 +17,6 @@ import numpy as np
 
 from ..core import (
     AnyArray,
-    DimensionError,
     StateSpace,
     Storable,
     block_diagonal,
@@ -64,8 +63,6 @@ def unit_residuals(
 ) -> UnitResiduals:
     """Return residuals of units, whose responses have the shape (frequency, p, m), beside weights or a cover."""
     unit_ids, inside = tuple(responses), np.array([unit not in outside for unit in responses])
-    if not inside.any():
-        raise DimensionError(f"Residuals of units: needs a unit that is covered, found {', '.join(unit_ids)}.")
     E = residual(form, nominal[1], np.stack(list(responses.values())))
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
     names = form, nominal[0], unit_ids, tuple(unit for unit in unit_ids if unit in outside)

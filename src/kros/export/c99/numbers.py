@@ -14,7 +14,7 @@ from ...observer import Observer, recorded_channel, recorded_factors
 from ...observer.filter_bank import longest_age
 from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
-from ...observer.screen import BEYOND, LONGEST, Screen
+from ...observer.screen import BEYOND, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ..text import plain, plain_names, require_identifier
 from .origin import RULE, OriginShift, find_shift
@@ -122,7 +122,8 @@ class Source:
             "guard": np.clip([low, high], -self.precision.largest, self.precision.largest),
             "bounds": self.bounds(),
             "longest_age": longest_age,
-            "rule": {"longest": LONGEST, "beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},
+            "rule": {"beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},
+            "longest": Screen.of(o).longest,
             "far": RULE.far,
         } | self.linear()
 

@@ -13,7 +13,6 @@ units bounds the error for every ``sum_i a_i w_i``, ``sum_i |a_i| <= 1``, of the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -53,31 +52,16 @@ class SignalBound:
         """Whether every state has a bound for all units that are not outside."""
         return bool(np.isfinite(self.cover).all())
 
-    @property
-    def ratios(self) -> Array:
-        """Bounds over errors, shape (units, n)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.errors > 0, self.bounds / self.errors, np.inf)
-
     def percent(self) -> dict[str, float | None]:
         """Return the bound by state, percent of the range; None where there is none."""
         values = 100 * self.cover / self.sizes
         return {name: float(v) if np.isfinite(v) else None for name, v in zip(self.states, values, strict=True)}
 
-    def facts(self, measured: Sequence[int] = ()) -> Record:
-        """Return what goes into the metrics; ratios are those of hidden states, of all where none is."""
+    def facts(self) -> Record:
+        """Return what goes into the metrics."""
         if not self.certified:
             return {"set_certified": False, "set_reason": self.reason}
-        hidden = [j for j in range(len(self.states)) if j not in measured] or list(range(len(self.states)))
-        ratios = self.ratios[:, hidden]
-        finite = ratios[np.isfinite(ratios)].tolist()
-        return {
-            "set_certified": True,
-            "set_bound_percent": self.percent(),
-            "set_bound_to_error_min": min(finite, default=None),
-            "set_bound_to_error_max": max(finite, default=None),
-            "set_outside": list(self.outside),
-        }
+        return {"set_certified": True, "set_bound_percent": self.percent(), "set_outside": list(self.outside)}
 
 
 def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: EpisodeBatch) -> SignalBound:

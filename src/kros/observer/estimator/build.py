@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -152,9 +153,10 @@ def best_family(
     settings: EstimatorSettings,
     hidden: Sequence[int],
 ) -> tuple[Readout, Readout, str]:
-    """Return the readout of the first family after which the next is not better by the margin on left-out units.
+    """Return the readout of the family that is better by the margin on left-out units than the simpler ones.
 
-    Beside it stands that of inputs alone. The families before the richest are fitted in one go.
+    Beside it stands that of inputs alone. The families before the richest are fitted in one go; the richest is only
+    where the one before it is the best of them.
     """
     names, n = [*lifting.states, *inputs], lifting.n_states
     ends = (lifting.sizes_of(names) * recordings.ranges).T.tolist()
@@ -166,13 +168,17 @@ def best_family(
 
     plain = [design(family) for family in FAMILIES[:-1]]
     *readouts, blind = Readout.of([*plain, Design.of(plain[0].channels.without_measurements(), recordings, settings)])
-    best, family, following = readouts[0], FAMILIES[0], iter(readouts[1:])
-    for name in FAMILIES[1:]:
-        richer = next(following, None) or Readout.of([design(name)])[0]
-        if not is_less(richer.by_fold(hidden), best.by_fold(hidden), settings.margin):
-            break
-        best, family = richer, name
-    return best, blind, family
+    families = dict(zip(FAMILIES, readouts, strict=False))
+
+    def better(family: str, other: str) -> str:
+        one, before = (families[name].by_fold(hidden) for name in (other, family))
+        return other if is_less(one, before, settings.margin) else family
+
+    family = reduce(better, families)
+    if family == FAMILIES[-2]:
+        families[FAMILIES[-1]] = Readout.of([design(FAMILIES[-1])])[0]
+        family = better(family, FAMILIES[-1])
+    return families[family], blind, family
 
 
 def assembled(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...core import ByName, ConfigError, DataError, Progress, Record, Work
+from ...core import ByName, ConfigError, DataError, Progress, Record, Work, write_bytes, write_json
 from ...data import Population, detect_reader
 from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.recording import check_population
@@ -78,9 +77,8 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
         findings.append(f"kros run would refuse this: {error}")
     text = study_text(source, data, discovery, findings)
     validate_config(tomllib.loads(text), folder, str(out))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(text, encoding="utf-8")
-    out.with_name(SCHEMA).write_text(json.dumps(study_schema(), indent=1), encoding="utf-8")
+    write_bytes(out, text.encode())
+    write_json(out.with_name(SCHEMA), study_schema())
     until = " --until identify" if len(population.units) < FEWEST else ""
     lines = [repr(population), *([discovery.reading] if discovery else [])]
     lines += [f"looks wrong: {text}" for text in findings]

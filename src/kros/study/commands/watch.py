@@ -62,11 +62,11 @@ def place_of(path: Path, changing: Path, folder: Path, out: Path) -> Path:
 
 def judged(config: StudyConfig, store: Store, path: Path, place: Path, folder: Path, out: Path) -> Iterator[str]:
     """Check one recording, alone in a folder like its own, and write its result; yield its line, none if it changed."""
-    name, result = str(path.relative_to(folder)), Record()
+    name, result = str(path.relative_to(folder)).encode(errors="backslashreplace").decode(), Record()
     with draft_beside(out) as draft:
         try:
             if path.is_file():
-                target = draft / name
+                target = draft / path.relative_to(folder)
                 target.parent.mkdir(parents=True)
                 link_or_copy(path, target)
             rows = verdicts(config, store, draft if path.is_file() else path)

@@ -21,6 +21,7 @@ from ...identify import Factor, ModelSet
 from ...identify.edmd import bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
 from ...uncertainty import Form, UncertainModel, choose_nominal, residual
+from ...uncertainty.forms import evenly
 from ...uncertainty.noise import NoiseShare, noise_share
 from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
@@ -69,8 +70,7 @@ def _attempt(name: str, task: Callable[[], Result]) -> Result | None:
 def _noise(context: Context, models: ModelSet, uncertain: UncertainModel) -> Callable[[], NoiseShare]:
     """Return work that compares variation and noise of EDMD models of some units, the nominal one among them."""
     units = uncertain.unit_ids
-    some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
-    chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
+    chosen = [units[k] for k in np.union1d(evenly(len(units), DEFAULT.units), [uncertain.nominal])]
     recorded = context.identified.factors[context.facts.identify_on]
     rows = np.array(list(zip_longest(*map(recorded.rows_of, chosen), fillvalue=-1))).T  # the last one is zero
     parts = recorded.factor.R, recorded.factor.peak, recorded.factor.n_samples

@@ -198,6 +198,5 @@ def facts_of_folds(folds: Sequence[dict[str, Record]]) -> dict[str, Record]:
             "orders": sorted({e["order"] for e in observers}),
             "relift_certified": sum(bool(e["relift_certified"]) for e in observers) if observers else None,
             "robust": sum(e.get("worst_case_h2") is not None for e in observers) if observers else None,
-            "reasons": sorted({str(e[key]) for e in entries for key in ("reason", "relift_reason") if e.get(key)}),
         }
     return facts

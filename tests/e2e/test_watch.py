@@ -59,6 +59,16 @@ def test_damaged_files_are_refused_and_the_watch_goes_on(kros, run, tmp_path) ->
     assert kros("watch", new, tmp_path).exit_code == 2
 
 
+def test_a_name_in_another_encoding_is_refused(run, tmp_path) -> None:
+    new = tmp_path / "new"
+    new.mkdir()
+    with open(os.fsencode(new / "c") + b"\xff_0.csv", "w") as file:
+        file.write(recording(9))
+    command = [sys.executable, "-m", "kros", "watch", new, run, "--once"]  # a log with such a name breaks pytest-xdist
+    done = subprocess.run(command, check=True, capture_output=True)
+    assert done.stdout.split()[:2] == [b"refused", rb"c\udcff_0.csv:"]
+
+
 def test_a_growing_file_is_waited_for_and_sigterm_ends_cleanly(run, tmp_path) -> None:
     new, text = tmp_path / "new", recording(9)
     new.mkdir()

@@ -238,6 +238,18 @@ def test_any_pattern_of_losses_leaves_the_estimate_bounded_and_is_forgotten(moto
     assert (apart[-1] <= apart[300:].max(axis=0) + 1e-12).all()
 
 
+def test_an_input_that_is_lost_is_held_and_starts_nothing_anew(motors):
+    observer, batch = motors
+    y, u = batch.measurements((0,)), batch.inputs
+    lost, held = u.copy(), u.copy()
+    lost[100:150], held[100:150] = np.nan, u[99]
+    wanted = run_observer(observer, y, held)
+    np.testing.assert_array_equal(run_observer(observer, y, lost), wanted)
+    running = observer.start(y[0, 0])
+    rows = [np.asarray(running.step(y[k, 0], lost[k, 0])) for k in range(499)]
+    np.testing.assert_allclose(rows, wanted[1:, 0], atol=1e-8 * np.abs(wanted).max())
+
+
 def test_batches_and_single_machines_are_alike_with_and_without_gaps(motors):
     observer, batch = motors
     y = batch.states[:300, :, :1].copy()

@@ -90,9 +90,6 @@ def test_shares_do_not_depend_on_units_of_measure() -> None:
 
 def test_bad_input_is_refused() -> None:
     models = static(0.02, 0.02, units=3, draws=4)
-    one = ModelSamples(("a",), *(KoopmanMatrices(m.A[:1], m.B[:1]) for m in (models.estimate, models.samples)))
-    with pytest.raises(DataError, match="at least two units"):
-        noise_share(one, ONE, FREQS, DT, Form.ADDITIVE)
     broken = models.samples.B.copy()
     broken[1, 2] = np.nan
     drawn = ModelSamples(models.unit_ids, models.estimate, KoopmanMatrices(models.samples.A, broken))

@@ -211,6 +211,14 @@ def test_one_unit_in_two_groups(tmp_path: Path) -> None:
         read_csv_folder(tmp_path, mapping(files=r"(?P<group>\w+)/(?P<unit>a)_(?P<episode>\d)"))
 
 
+def test_an_episode_of_a_file_with_several_is_left_out_by_its_name(tmp_path: Path) -> None:
+    rows = [f"{run},{0.1 * k:.1f},{k},{k * k}" for run in (1, 2, 3) for k in range(5)]
+    (tmp_path / "a.csv").write_text("\n".join(["run,t,pos,volt", *rows]))
+    given = {"files": "(?P<unit>a)", "labels": {"episode": "run"}}
+    episodes = {text: read_csv_folder(tmp_path, mapping(**given, exclude=text)).episodes for text in ("#a/.*/2$", "b")}
+    assert [[key.episode for key in keys] for keys in episodes.values()] == [["1", "3"], ["1", "2", "3"]]
+
+
 def test_pieces_are_the_recording_in_parts(tmp_path: Path) -> None:
     write(tmp_path / "a.csv", samples(0))
     whole = read_csv_folder(tmp_path, mapping(files="(?P<unit>a)"))
@@ -223,13 +231,17 @@ def test_pieces_are_the_recording_in_parts(tmp_path: Path) -> None:
     np.testing.assert_allclose(parts.read(parts.episodes[0])[:, 1], samples(1)[:16, 2])
 
 
-@pytest.mark.parametrize("text", ["31.12.2023 23:59:59,5", "2023-12-31T23:59:59.500Z", "12/31/2023 23:59:59.5"])
+@pytest.mark.parametrize(
+    "text",
+    ["31.12.2023 23:59:59,5", "2023-12-31T23:59:59.500Z", "12/31/2023 23:59:59.5", "2023-12-31T23:59:59.500+01:00"],
+)
 def test_timestamps_over_the_turn_of_a_year(tmp_path: Path, text: str) -> None:
     order = {"3": "dmy", "2": "ymd", "1": "mdy"}[text[0]]
     turned = {"dmy": "01.01.2024 00:00:00,", "ymd": "2024-01-01T00:00:00.", "mdy": "01/01/2024 00:00:00."}[order]
+    zone = text[23:] if order == "ymd" else ""
     rows = [
         f"{text};1;2",
-        *(f"{turned}{'0' if k == 0 else '5'}{'Z' if order == 'ymd' else ''};{k};{k * k}" for k in range(2)),
+        *(f"{turned}{'0' if k == 0 else '5'}{zone};{k};{k * k}" for k in range(2)),
     ]
     (tmp_path / "a.csv").write_text("\n".join(["t;pos;volt", *rows]))
     population = read_csv_folder(tmp_path, mapping(files="a", delimiter=";", timestamp=order))

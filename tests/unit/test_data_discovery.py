@@ -183,6 +183,19 @@ def test_lines_before_the_numbers(tmp_path: Path):
         look_at(path)
 
 
+@pytest.mark.parametrize("bad", range(3))
+def test_one_clock_that_runs_back_hides_time_in_no_other_file(tmp_path: Path, bad: int):
+    rng = np.random.default_rng(0)
+    for number, (unit, run) in enumerate((u, r) for u in "ab" for r in (1, 2, 3)):
+        values = np.column_stack([0.01 * np.arange(60), rng.normal(size=(60, 3))])
+        values[40:, 0] -= 0.3 if number == bad else 0.0
+        (tmp_path / unit).mkdir(exist_ok=True)
+        np.savetxt(tmp_path / unit / f"{run}.csv", values, "%.5f", ",", header="time,angle,speed,voltage", comments="")
+    found = discover(tmp_path)
+    assert (len(found.population.episodes), found.mapping["time"]) == (5, "time")
+    assert [text.partition(":")[0] for text in found.findings] == [f"left out, a/{bad + 1}.csv"]
+
+
 def test_a_wild_sample_is_reported(tmp_path: Path):
     rng = np.random.default_rng(0)
     for unit, condition, episode in [(u, c, e) for u in "ab" for c in ("hot", "cold") for e in (1, 2, 3)]:

@@ -36,6 +36,17 @@ def test_another_sign_and_another_unit_of_measure_are_named(motors, name: str) -
     assert size.startswith(f"Unit {other}: {name} moves 0.01")
 
 
+def test_a_sensor_that_fails_for_a_while_is_named_with_its_episode(motors) -> None:
+    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+    data[motors.unit_ids[1]][1][300:700, 1] = data[motors.unit_ids[1]][1][300, 1]
+    data[motors.unit_ids[2]][0][200:203, 0] = -9999.0
+    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
+    found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)
+    _, stuck, code = kros.identify(found, refine=False).facts.alerts  # and the size of its position
+    assert stuck.startswith(f"Episode 1 of unit {motors.unit_ids[1]} (default): velocity stays the same for 40 % of it")
+    assert code.startswith(f"Episode 0 of unit {motors.unit_ids[2]} (default): position jumps by ")
+
+
 def test_a_unit_that_is_moved_less_is_not_doubted(motors) -> None:
     names = [c.name for c in motors.channels]
     assert alerts(motors, {(motors.unit_ids[2], name): 0.05 for name in names}) == ()

@@ -35,6 +35,7 @@ class CheckRule:
     ratio: float = 8.0
     correlation: float = 0.5  # of channels, from which on its sign counts
     held: float = 0.2  # share of an episode in which a state stays the same, from which on its sensor is doubted
+    jump: float = 2.0  # change of a state between two samples, in ranges of most of them, beyond which it is doubted
     constant: float = ROUNDING  # of the largest value: what filters and scales make of a constant
     # sampling periods outside are usual for a time in ms or us that is taken for seconds
     shortest_s: float = 1e-6

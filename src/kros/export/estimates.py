@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core import Array, Bits, Record, write_json
+from ..core.files import draft_beside
 from ..data import EpisodeKey
 from ..observer import SampleStatus
 
@@ -34,14 +35,12 @@ def writer(out: Path, period_s: float, facts: Record) -> Iterator[Write]:
         columns.append(pa.field(shown, pa.float64(), metadata={"unit": unit} if unit else None))
     about = {n: v if isinstance(v, str) else json.dumps(v) for n, v in facts.items() if v is not None}
     schema = pa.schema(columns, metadata=about)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.partial")
-    try:
+    with draft_beside(out.absolute().parent) as draft:
         with (
-            csv.CSVWriter(temporary, schema)
+            csv.CSVWriter(draft, schema)
             if text
-            else parquet.ParquetWriter(temporary, schema, write_page_checksum=True)
-        ) as file:
+            else parquet.ParquetWriter(draft, schema, write_page_checksum=True) as file
+        ):
 
             def write(key: EpisodeKey, start: int, status: Bits, values: Array) -> None:
                 labels = [pa.repeat(name, len(values)) for name in (key.unit, key.condition, key.episode)]
@@ -57,6 +56,4 @@ def writer(out: Path, period_s: float, facts: Record) -> Iterator[Write]:
             yield write
         if text:
             write_json(out.with_name(f"{out.name}-metadata.json"), facts)
-        temporary.replace(out)
-    finally:
-        temporary.unlink(missing_ok=True)
+        draft.replace(out)

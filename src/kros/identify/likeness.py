@@ -16,10 +16,11 @@ def moments(values: Array) -> Array:
     return np.cov(np.hstack([values[1:], changes]).T, bias=True)
 
 
-def longest_holds(values: Array) -> Array:
-    """Return the longest time that each channel of an episode (n_samples, c) stays the same while others move.
+def course(values: Array) -> Array:
+    """Return three numbers of every channel of an episode (n_samples, c), shape (3, c).
 
-    It is a share of the episode; zero where no other channel moves by half of its span meanwhile.
+    They are the longest share of the episode in which it stays the same while another channel moves by half of its
+    span, its largest change from one sample to the next, and the range of 98 % of its samples.
     """
     shares, far = np.zeros(values.shape[1]), np.ptp(values, axis=0) / 2
     for i, column in enumerate(values.T):
@@ -28,17 +29,21 @@ def longest_holds(values: Array) -> Array:
         part = values[ends[longest] : ends[longest + 1]]
         if (np.ptp(part, axis=0) > far).any():
             shares[i] = len(part) / len(values)
-    return shares
+    low, high = np.quantile(values, (0.01, 0.99), axis=0)
+    return np.array([shares, np.abs(np.diff(values, axis=0)).max(axis=0), high - low])
 
 
-def stuck(episodes: Sequence[str], channels: Sequence[str], shares: Array) -> list[str]:
-    """Return a sentence for every state of an episode that stays the same far longer than in most, (episodes, n)."""
-    longer = (shares > CHECK.held) & (shares > CHECK.ratio * np.median(shares, axis=0))
-    return [
-        f"{episodes[i]}: {channels[k]} stays the same for {100 * shares[i, k]:.0f} % of it while others move; leave it "
-        "out if its sensor was stuck."
-        for i, k in np.argwhere(longer).tolist()
+def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> list[str]:
+    """Return a sentence for every state that stays the same, or jumps, unlike in most episodes, (episodes, 3, n)."""
+    shares, jumps, spans = np.swapaxes(courses, 0, 1)
+    held = (shares > CHECK.held) & (shares > CHECK.ratio * np.median(shares, axis=0))
+    times = jumps / np.maximum(np.maximum(spans, np.median(spans, axis=0)), TINY)
+    found = [
+        (i, k, f"stays the same for {100 * shares[i, k]:.0f} % of it while others move") for i, k in np.argwhere(held)
     ]
+    far = np.argwhere(times > CHECK.jump)
+    found += [(i, k, f"jumps by {times[i, k]:.3g} times its range between two samples") for i, k in far]
+    return [f"{episodes[i]}: {channels[k]} {what}; if its sensor failed, leave it out." for i, k, what in found]
 
 
 def unlike(units: Sequence[str], channels: Sequence[str], covariances: Sequence[Array]) -> list[str]:

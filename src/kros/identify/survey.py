@@ -22,7 +22,7 @@ from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_ep
 from ..data.prepare import recording_marks
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..data.recording import CHECK, check_population, refuse_copies, some, title, usable_episodes
-from .likeness import longest_holds, moments, stuck, unlike
+from .likeness import course, moments, odd, unlike
 
 
 def period_alerts(period_s: float) -> tuple[str, ...]:
@@ -101,7 +101,7 @@ class _EpisodeFacts:
     key: EpisodeKey
     digest: str
     n_samples: int
-    holds: Array  # of the states, see `likeness`
+    course: Array  # of the states, see `likeness`
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def _facts(
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
     train, test = (tuple(k for s in splits.values() for k in getattr(s, name)) for name in _PARTS)
     digests = {e.key: e.digest for e in episodes}
-    held = stuck([title(e.key) for e in episodes], retained.states, np.array([e.holds for e in episodes]))
+    strange = odd([title(e.key) for e in episodes], retained.states, np.array([e.course for e in episodes]))
     return RecordingFacts(
         identify_on=condition_of(population.select(part), options.identify_on),
         groups=groups,
@@ -191,7 +191,7 @@ def _facts(
         test=test,
         resolution={m: min(g.resolution[m] for g in read) for m in retained.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
-        alerts=(*period_alerts(retained.sample_period_s), *_unlike(retained, read, groups), *held),
+        alerts=(*period_alerts(retained.sample_period_s), *_unlike(retained, read, groups), *strange),
         reserve=tuple(options.reserve),
         digests=tuple(digests[key] for key in train + test),
     )
@@ -237,8 +237,8 @@ def _read_group(task: _Group) -> _GroupFacts:
         for key, values, digest in usable_episodes(population, task.on_nan):
             for name in population.measured if not episodes else ():
                 resolution[name] = smallest_step(values[:, names.index(name)])
-            holds = longest_holds(values[:, : len(names)])[: len(population.states)]
-            episodes.append(_EpisodeFacts(key, digest, len(values), holds))
+            of_states = course(values[:, : len(names)])[:, : len(population.states)]
+            episodes.append(_EpisodeFacts(key, digest, len(values), of_states))
             covariances.append(moments(values[:, : len(names)]))
             yield key, values, digest
 

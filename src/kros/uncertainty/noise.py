@@ -61,8 +61,6 @@ def noise_share(
 ) -> NoiseShare:
     """Compare the residuals between units with those between resampled models, of responses divided by `scale`."""
     (units, draws, _, n), m = models.samples.A.shape, models.samples.B.shape[-1]
-    if units < 2 or draws < 2:
-        raise DataError(f"Noise share: needs at least two units and two draws of each, found {units} and {draws}.")
     parts = (models.estimate.A, models.estimate.B, models.samples.A, models.samples.B)
     for unit, *matrices in zip(models.unit_ids, *parts, strict=True):
         if not all(np.isfinite(M).all() for M in matrices):

@@ -116,7 +116,6 @@ class ResidualH2(Method):
             raise SynthesisError("Residual-shaped observer: the nonlinear observer diverges on the training episodes.")
         facts = {
             "training_error_to_open_loop": error,
-            "order_reduction_percent": syntheses[best].gap_percent,
             "rows_fitted_to_single_steps": [given.lifting.states[i] for i in models[best].refitted],
         }
         return Design(task.name, observers[best], syntheses[best], facts)

@@ -37,12 +37,12 @@ def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> lis
     """Return a sentence for every state that stays the same, or jumps, unlike in most episodes, (episodes, 3, n)."""
     shares, jumps, spans = np.swapaxes(courses, 0, 1)
     held = (shares > CHECK.held) & (shares > CHECK.ratio * np.median(shares, axis=0))
-    times = jumps / np.maximum(np.maximum(spans, np.median(spans, axis=0)), TINY)
+    size = np.maximum(spans, np.median(spans, axis=0))
     found = [
         (i, k, f"stays the same for {100 * shares[i, k]:.0f} % of it while others move") for i, k in np.argwhere(held)
     ]
-    far = np.argwhere(times > CHECK.jump)
-    found += [(i, k, f"jumps by {times[i, k]:.3g} times its range between two samples") for i, k in far]
+    far = np.argwhere((jumps > CHECK.jump * size) & (size > 0))
+    found += [(i, k, f"jumps by {jumps[i, k] / size[i, k]:.3g} times its range between two samples") for i, k in far]
     return [f"{episodes[i]}: {channels[k]} {what}; if its sensor failed, leave it out." for i, k, what in found]
 
 

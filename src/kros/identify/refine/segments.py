@@ -96,14 +96,14 @@ class Segments:
 def read_segments(
     population: Population, keys: Keys, horizon: int, count: int, seed: int, history: int = 0
 ) -> Segments:
-    """Draw segments of every unit, those of its last episode at the end; the order of units has no part in it."""
+    """Draw segments of every unit, those of its last episode at the end."""
     n, width, length = len(population.states), len(population.channels), history + horizon + 1
     values = np.empty((length, width, len(keys), count))
     valid = np.ones((length, len(keys), count), dtype=bool)
     for row, (unit, episodes) in enumerate(keys.items()):
         if not episodes:
             raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out.")
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng([seed, row])
         earlier, held = max(1, len(episodes) - 1), held_segments(count, keys)
         owners = np.array([*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held])
         for episode in dict.fromkeys(owners.tolist()):

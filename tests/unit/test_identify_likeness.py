@@ -38,7 +38,7 @@ def test_another_sign_and_another_unit_of_measure_are_named(motors, name: str) -
 
 def test_a_sensor_that_fails_for_a_while_is_named_with_its_episode(motors) -> None:
     data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
-    data[motors.unit_ids[1]][1][300:700, 1] = data[motors.unit_ids[1]][1][300, 1]
+    data[motors.unit_ids[1]][1][300:, 1] = data[motors.unit_ids[1]][1][300, 1]
     data[motors.unit_ids[2]][0][200:203, 0] = -9999.0
     names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
     found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)

@@ -246,7 +246,7 @@ def certificate(task: DesignTask, design: Design, problem: ObserverProblem | Non
 
 
 def require_useful(problem: ObserverProblem, observer: Observer, errors: StateSpace, bound: float) -> None:
-    """Refuse a bound that is no better than that of no estimate: models relate states as recordings hardly do."""
+    """Refuse a bound that is no better than without an estimate: models relate states less closely than machines."""
     rows, dt = problem.nominal.n_outputs, problem.nominal.dt
     nothing = gain(np.zeros((rows, len(observer.measured) + rows + problem.nominal.n_inputs)), dt)
     without = certify_errors(problem, problem.estimate_error(nothing))[0]

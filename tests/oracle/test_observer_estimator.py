@@ -18,6 +18,7 @@ from kros.observer import EstimatorSettings, Observer, Recordings, identify_esti
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
+from kros.observer.estimator.gaps import decay
 from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated, samples
 
@@ -46,7 +47,7 @@ def motors() -> tuple[Observer, EpisodeBatch]:
 
 def test_a_bank_is_its_system_and_blocks_are_sums_of_steps():
     rng = np.random.default_rng(0)
-    bank = Bank(4, 3, 1, (0, 1, 2, 4, 7, 12), (5.0, 20.0), (2.0, 8.0))
+    bank = Bank(4, 3, 1, (0, 1, 2, 4, 7, 12), (5.0, 20.0), (2.0, 8.0), (8 + 3j, 20 - 4j))
     v = np.column_stack([rng.normal(size=(60, 3)), np.ones(60)])
     coarse, fine = bank.rows(v, np.arange(60)), bank.fine.rows(v, np.arange(60))
     A, B, S = bank.fine.system()
@@ -208,9 +209,10 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
 def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
     observer = exact[0].observer
     assert observer.bank is not None
-    bank = replace(observer.bank, half=np.full(3, 1e12), forget=np.ones(3), reach=np.zeros(1))
-    A, B = observer.A.copy(), observer.B.copy()
-    A[-3:], B[-3:] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses a straight line linearly
+    bank = replace(observer.bank, half=np.full(3, 1e12), reach=np.zeros(1))
+    A, B, n = observer.A.copy(), observer.B.copy(), observer.lifting.n_states
+    A[n - 6 : n], B[n - 6 : n] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses it linearly
+    A[n - 3 : n, n - 3 : n] = np.eye(3)
     observer = replace(observer, bank=bank, A=A, B=B)
     y, u = np.linspace(0.0, 2.0, 200)[:, None, None], np.zeros((200, 1, 1))
     lost = y.copy()
@@ -396,3 +398,39 @@ def test_trust_in_the_start_ignores_groups_in_which_a_state_rests():
     np.testing.assert_array_equal(resting.best(errors, settings), [0, 0, 0])
     errors[:, 1] = -0.3  # fourteen percent less, everywhere
     np.testing.assert_array_equal(resting.best(errors, settings), [1, 1, 1])
+
+
+def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():
+    rng = np.random.default_rng(1)
+    F, decays = np.zeros((3, 3)), np.empty((3000, 8, 3))
+    F[:2, :2] = np.exp(-0.01) * np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])
+    F[2, 2] = 0.97
+    decays[0] = rng.normal(size=(8, 3))
+    for k in range(2999):
+        decays[k + 1] = decays[k] @ F.T + 0.1 * rng.normal(size=(8, 3))
+    found = decay(decays + 0.05 * rng.normal(size=decays.shape), [1, 2])
+    np.testing.assert_allclose(np.linalg.matrix_power(found, 20), np.linalg.matrix_power(F, 20), atol=0.1)
+    apart = np.concatenate([decays[..., 2:], np.cumsum(decays[..., 2:], axis=0)], axis=-1)  # an integrator
+    assert np.abs(np.linalg.eigvals(decay(apart, [0]))).max() <= 1.0
+
+
+def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():
+    pendulums = kros.plants.PendulumPopulation(n_units=5, n_episodes=4, seconds=10.0, seed=3).simulate().population
+    uncertain = kros.quantify(kros.identify(pendulums, lifting=["sin(position)"], refine=False), n_freqs=50)
+    designs = [
+        kros.synthesize(uncertain, f"koopman_edmd/{method}", methods=()) for method in ("estimator", "open_loop")
+    ]
+    keys = uncertain.models.facts.test
+    batch = EpisodeBatch.read(pendulums, keys, 1000, uncertain.models.parameters)
+    y = batch.states[..., :1].copy()
+    y[300:700] = np.nan
+    estimate = run_observer(designs[0].observer, y, batch.inputs)
+    first = estimate[300, :, :2]
+    model, x = designs[1].observer, first
+    errors = []
+    for k in range(300, 700):
+        errors.append([estimate[k, :, :2] - batch.states[k], x - batch.states[k]])
+        lifted = model.lifting.lift(x, {}), model.lifting.lift_inputs(batch.inputs[k], x, {})
+        x = (lifted[0] @ model.A.T + lifted[1] @ model.B.T)[:, :2]
+    rms = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
+    assert (rms[0] <= 1.2 * rms[1]).all()

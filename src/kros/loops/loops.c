@@ -49,7 +49,7 @@ typedef struct {
     whole q;
     whole own;         /* every machine has a map of its own: one observer, map (batch, rows, columns) */
     whole fresh;       /* earlier values equal the present ones at the first sample */
-    whole recorded;    /* first states, whose last ones are the fallback while measurements are missing; none */
+    whole recorded;    /* first states; the last ones are those from inputs alone, and how far apart they are; none */
     whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
     const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
     const double *y;          /* (samples, q, batch); none where nothing is measured */
@@ -61,8 +61,8 @@ typedef struct {
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
     double *past;             /* (observers, batch, earlier), moved on */
     const double *reach;      /* (q) */
-    const double *bank;       /* (4, recorded, batch): forget, half, recovery, longest age */
-    double *gap;              /* (2 recorded + q + q filters, batch): offset, age, count, ramps; moved on */
+    const double *bank;       /* (3, recorded, batch): half, recovery, longest age */
+    double *gap;              /* (recorded + q + q filters, batch): age, count, ramps; moved on */
     double *states;           /* (samples, observers, n, batch): x before every sample; none */
 } relift_job;
 
@@ -236,26 +236,40 @@ static vec level(vec age, vec half)
 }
 
 /* Gaps of a filter bank, see kros.observer.filter_bank for the symbols: measurements and what stands for missing ones, into states; straight lines
-   over gaps that end. `held` is the fallback. */
-static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg, vec *y, vec *held, mask *missing, whole n, whole w)
+   over gaps that end. */
+static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg, vec *y, mask *missing, whole n, whole w)
 {
     const whole r = s->filters, recorded = s->recorded;
+    const vec *from_inputs = reg + (n - 2 * recorded) * MOST;
+    vec *offset = reg + (n - recorded) * MOST;
     for (whole j = 0; j < s->q; j++)
         for (whole v = 0; v < w; v++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
-            const vec seen = y[row], count = gap[2 * recorded * MOST + row], last = reg[(n - recorded) * MOST + i] + gap[i];
-            const vec reach = (1.0 - level(gap[recorded * MOST + i], bank[recorded * MOST + i])) * s->reach[j];
-            const vec apart = reg[i] - last, near = either(apart < -reach, -reach, either(apart > reach, reach, apart));
+            const vec seen = y[row], count = gap[recorded * MOST + row], held = from_inputs[i] + offset[i];
+            const vec reach = (1.0 - level(gap[i], bank[i])) * s->reach[j];
+            const vec apart = reg[i] - held, near = either(apart < -reach, -reach, either(apart > reach, reach, apart));
             const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
-            const vec jump = either(ends, (seen - (last + near)) / (count + 1.0), (vec){0});
-            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(2 * recorded + s->q + j * r + l) * MOST + v] * jump;
-            held[row] = last, missing[row] = lost;
-            reg[i] = y[row] = either(lost, last + near, seen);
+            const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
+            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(recorded + s->q + j * r + l) * MOST + v] * jump;
+            missing[row] = lost;
+            reg[i] = y[row] = either(lost, held + near, seen);
+        }
+    for (whole i = 0; i < recorded; i++)
+        for (whole v = 0; v < w; v++) {
+            const whole at = i * MOST + v;
+            mask lost = {0}, own = {0};
+            int hidden = 1;
+            for (whole j = 0; j < s->q; j++) {
+                lost |= missing[j * MOST + v];
+                if (s->measured[j] == i) own = missing[j * MOST + v], hidden = 0;
+            }
+            const vec share = either(hidden ? lost : own, (vec){0}, 1.0 - hidden * level(gap[at], bank[at]));
+            offset[at] += share * (reg[at] - from_inputs[at] - offset[at]);
         }
 }
 
-/* The fallback into the next estimates; ages, ramps and offsets move on. */
-static void follow(const relift_job *s, const vec *bank, vec *gap, const vec *reg, vec *next, const vec *held, const mask *missing, vec *ramp, whole n, whole columns, whole w)
+/* The fallback into the next estimates; ages and ramps move on. */
+static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, const mask *missing, vec *ramp, whole n, whole columns, whole w)
 {
     const whole r = s->filters, q = s->q, recorded = s->recorded;
     for (whole v = 0; v < w; v++) {
@@ -263,7 +277,7 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, const vec *re
         vec longest = {0};
         for (whole j = 0; j < q; j++) {
             const mask lost = missing[j * MOST + v];
-            vec *count = gap + (2 * recorded + j) * MOST + v, *of = gap + (2 * recorded + q + j * r) * MOST + v;
+            vec *count = gap + (recorded + j) * MOST + v, *of = gap + (recorded + q + j * r) * MOST + v;
             const int moves = any(lost | (*count > 0.0));
             *count = either(lost, *count + 1.0, (vec){0});
             longest = either(*count > longest, *count, longest);
@@ -277,16 +291,13 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, const vec *re
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
         for (whole i = 0; i < recorded; i++) {
-            vec last = reg[i * MOST + v], *offset = gap + i * MOST + v, *age = offset + recorded * MOST;
-            double hidden = 1.0;
-            const vec *of = bank + i * MOST + v, half = of[recorded * MOST];
-            const vec oldest = of[3 * recorded * MOST], fallback = reg[(n - recorded + i) * MOST + v];
-            for (whole j = 0; j < q; j++)
-                if (s->measured[j] == i) last = either(missing[j * MOST + v], held[j * MOST + v], last), hidden = 0.0;
-            *offset = of[0] * (last - fallback + hidden * level(*age, half) * (*offset - last + fallback));
-            const vec recovered = either(some, *age, of[2 * recorded * MOST] * either(*age > oldest, oldest, *age));
-            *age = either(longest > recovered, longest, recovered);
-            next[i * MOST + v] += hidden * level(*age, half) * (next[(n - recorded + i) * MOST + v] + *offset - next[i * MOST + v]);
+            const whole at = i * MOST + v;
+            const vec half = bank[at], oldest = bank[2 * recorded * MOST + at], old = gap[at];
+            const vec recovered = either(some, old, bank[recorded * MOST + at] * either(old > oldest, oldest, old));
+            int hidden = 1;
+            for (whole j = 0; j < q; j++) hidden &= s->measured[j] != i;
+            gap[at] = either(longest > recovered, longest, recovered);
+            if (hidden) next[at] += level(gap[at], half) * (next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at] - next[at]);
         }
     }
 }
@@ -294,21 +305,21 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, const vec *re
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? 2 * recorded + q + q * s->filters : 0;
-    vec *bank = vectors(4 * recorded), *gap = vectors(gaps), *held = vectors(q), *missing = vectors(q), *ramp = vectors(s->filters);
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? recorded + q + q * s->filters : 0;
+    vec *bank = vectors(3 * recorded), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;
     const whole groups = (rows + 3) / 4;
     double *map = room(4 * groups * columns * (whole)sizeof(double));
     const vec **column = room(groups * columns * (whole)sizeof(vec *));
     whole *counts = room(groups * (whole)sizeof(whole));
-    int failed = !counts || !bank || !gap || !held || !missing || !ramp || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
+    int failed = !counts || !bank || !gap || !missing || !ramp || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
     for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
         const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
         settle(f, reg, first, batch, lanes);
         if (s->own)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
-        for (whole i = 0; i < 4 * recorded; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
+        for (whole i = 0; i < 3 * recorded; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
         for (whole i = 0; i < gaps; i++) gather(gap + i * MOST, s->gap + i * batch + first, 1, lanes);
         for (whole o = 0; o < s->observers; o++) {
             double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;
@@ -341,14 +352,14 @@ int kros_relift(const formulas *f, const relift_job *s)
                         y[j * MOST + v] = either(seen - seen == 0.0, seen, x[v]);
                     }
                 }
-                if (recorded) fill(s, bank, gap, reg, y, held, (mask *)missing, n, w);
+                if (recorded) fill(s, bank, gap, reg, y, (mask *)missing, n, w);
                 for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
                 for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
                 evaluate(f, reg, lanes);
                 if (s->own) product_each(each, columns, column, next, rows, w);
                 else product(map, counts, column, next, rows, w);
                 shifted(f, reg, older);
-                if (recorded) follow(s, bank, gap, reg, next, held, (const mask *)missing, ramp, n, columns, w);
+                if (recorded) follow(s, bank, gap, next, (const mask *)missing, ramp, n, columns, w);
                 if (!within(s, o, rows, next, lanes)) {
                     s->left[o] = 1;
                     break;
@@ -363,7 +374,7 @@ int kros_relift(const formulas *f, const relift_job *s)
         }
         for (whole i = 0; i < gaps; i++) scatter(s->gap + i * batch + first, gap + i * MOST, 1, lanes);
     }
-    free(bank), free(gap), free(held), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);
+    free(bank), free(gap), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);
     return failed;
 }
 

@@ -133,7 +133,7 @@ class ObserverData:
             bank, recorded = self.bank, (len(self.recorded),)
             shapes = bank.start.shape, bank.half.shape[-1:], bank.recovery.shape, bank.reach.shape
             self._require("start, half, recovery and reach", shapes, ((n, rows + columns), recorded, recorded, (q,)))
-            if not 0 <= bank.filters <= (most := n - 2 * recorded[0]):
+            if not 0 <= bank.filters <= (most := n - 3 * recorded[0]):
                 raise DimensionError(
                     f"Observer {self.name}: its states leave at most {most} filters of measurements, found "
                     f"{bank.filters}."
@@ -166,7 +166,7 @@ class ObserverData:
     @property
     def internal(self) -> int:
         """Number of states at the end that recordings do not hold: those of a filter bank."""
-        return 0 if self.bank is None else self.lifting.n_states - len(self.bank.forget)
+        return 0 if self.bank is None else self.lifting.n_states - self.bank.half.shape[-1]
 
     @property
     def into(self) -> Array:

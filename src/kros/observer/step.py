@@ -59,7 +59,7 @@ class Steps:
         theta, inputs = self.lifting.lift(window, self.values), self.lifting.lift_inputs(u, window, self.values)
         following = np.concatenate([theta, self.x_c, inputs, y], axis=-1) @ self._map.T
         if self.gaps is not None:
-            self.gaps.follow(self.x, following[:, :n], missing)
+            self.gaps.follow(following[:, :n], missing)
         within = ((following >= self._low) & (following <= self._high)).all(axis=-1)
         going = ~self.waiting if moving is None else moving & ~self.waiting
         self.waiting |= going & ~within  # a step that would leave the bounds is not taken

@@ -55,9 +55,9 @@ def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, 
     old, new = observer.lifting, observer.lifting.in_sizes(sizes)
     inputs = (*observer.inputs, *old.input_functions)
     x, u = (old.sizes_of(names) / new.sizes_of(names) for names in (old.names, inputs))
-    if observer.bank is not None:  # what is estimated from inputs alone has the units of the recorded states
+    if observer.bank is not None:  # its last states have the units of the recorded ones
         n, recorded = old.n_states, len(observer.recorded)
-        x[n - recorded : n] = x[:recorded]
+        x[n - 2 * recorded : n] = np.tile(x[:recorded], 2)
     return x, u
 
 

@@ -28,7 +28,8 @@ class Estimator(Method):
         recordings = Recordings.of(training.keys, training.read_one, bias)
         channels = models.lifting, models.measured, models.recorded_inputs
         settings = models.sample_period_s, models.parameters_of(task.unit), self.settings
-        identified = identify_estimator(task.name, *channels, recordings, *settings)
+        poles = np.linalg.eigvals(models.A[models.index(task.unit)]).tolist()
+        identified = identify_estimator(task.name, *channels, recordings, *settings, poles)
         observer = replace(identified.observer, seen=self._seen(task), sensor=task.sensor)
         seconds = time.perf_counter() - began
         synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)

@@ -4,13 +4,15 @@ For a channel v the bank holds
 
 .. math:: v_k, \quad m_i - m_{i+1}, \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
 
-with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. Before the first
-sample everything is taken to equal it. As a system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`,
-:math:`\xi_{-1} = S v_0` (v ends with the constant channel 1), it is stable.
+with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. A resonance is a lag
+with a complex time constant, real and imaginary part. Before the first sample everything is taken to equal it. As a
+system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`, :math:`\xi_{-1} = S v_0` (v ends with the constant
+channel 1), it is stable.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -33,13 +35,16 @@ class Bank:
     taps: tuple[int, ...]  # where blocks of delays begin, in samples, from zero on, and where the last one ends
     lags: tuple[float, ...]  # samples
     starts: tuple[float, ...]  # samples
+    resonances: tuple[complex, ...] = ()  # samples
 
     @classmethod
-    def of(cls, channels: Channels, length: float, settings: EstimatorSettings) -> Bank:
-        """Return the bank for a median episode of this length in samples."""
+    def of(cls, channels: Channels, length: float, settings: EstimatorSettings, poles: Sequence[complex] = ()) -> Bank:
+        """Return the bank for a median episode of this length in samples; complex poles become resonances."""
         lags = () if channels.recent else settings.lags(length)
         starts = () if channels.recent else (*settings.start, *lags)
-        return cls(len(channels), channels.linear, channels.nonlinear, settings.blocks(length), lags, starts)
+        taps, slowest = settings.blocks(length), np.exp(-1 / length)
+        resonances = tuple(-1 / np.log(p * min(1.0, slowest / abs(p))) for p in poles if p.imag > 0)
+        return cls(len(channels), channels.linear, channels.nonlinear, taps, lags, starts, resonances)
 
     @property
     def delayed(self) -> int:
@@ -54,7 +59,8 @@ class Bank:
         """Channel of every entry, shape (len(self),)."""
         every, moving = np.arange(self.channels), np.arange(self.channels - 1)
         blocks = [moving[: self.delayed]] * (len(self.taps) - 2)
-        return np.concatenate([moving, *blocks, *[moving] * len(self.lags), *[every] * len(self.starts), every[-1:]])
+        lags = [moving] * (len(self.lags) + 2 * len(self.resonances))
+        return np.concatenate([moving, *blocks, *lags, *[every] * len(self.starts), every[-1:]])
 
     def rows(self, v: Array, at: Whole) -> Array:
         """Return the bank at samples `at` of signals v (n_samples, channels), shape (len(at), len(self))."""
@@ -64,8 +70,9 @@ class Bank:
         ends = [(tap, sums[at + self.taps[-1] + 1 - tap]) for tap in self.taps]
         means = [(one - other) / (b - a) for (a, one), (b, other) in pairwise(ends)]
         parts = [moving[at], *(one - other for one, other in pairwise(means))]
-        if self.lags:
-            parts.append(lagged(moving, np.exp(-1 / np.array(self.lags)), at))
+        for lags in filter(None, (self.lags, self.resonances)):
+            values = lagged(moving, np.exp(-1 / np.array(lags)), at)
+            parts += [values.real, values.imag] if np.iscomplexobj(values) else [values]
         parts += [np.exp(-at / tau)[:, None] * v[0] for tau in self.starts]
         return np.hstack([*parts, np.ones((len(at), 1))])
 
@@ -106,8 +113,8 @@ class Bank:
 
     def system(self) -> tuple[Array, Array, Array]:
         """Return A (p, p), B (p, channels) and S (p, channels) of a bank with every delay."""
-        p, c, moving, delayed = len(self), self.channels, self.channels - 1, self.delayed
-        A, B, S = np.zeros((p, p)), np.zeros((p, c)), np.zeros((p, c))
+        size, c, moving, delayed = len(self), self.channels, self.channels - 1, self.delayed
+        A, B, S = np.zeros((size, size)), np.zeros((size, c)), np.zeros((size, c))
         B[range(moving), range(moving)] = S[range(moving), range(moving)] = 1.0
         place = moving
         for i in range(self.taps[-1] - 1):
@@ -121,6 +128,13 @@ class Bank:
             rows, a = np.arange(place, place + moving), np.exp(-1 / tau)
             A[rows, rows], B[rows, range(moving)], S[rows, range(moving)] = a, 1 - a, 1.0
             place += moving
+        for resonance in self.resonances:
+            rows, p = np.arange(place, place + moving), np.exp(-1 / resonance)
+            others = rows + len(self.resonances) * moving
+            A[rows, rows], A[rows, others], A[others, rows], A[others, others] = p.real, -p.imag, p.imag, p.real
+            B[rows, range(moving)], B[others, range(moving)], S[rows, range(moving)] = 1 - p.real, -p.imag, 1.0
+            place += moving
+        place += len(self.resonances) * moving
         for tau in self.starts:
             rows, a = np.arange(place, place + c), np.exp(-1 / tau)
             A[rows, rows], S[rows, range(c)] = a, 1 / a

@@ -17,7 +17,7 @@ from ..observer import Observer
 from ..runtime import Runtime
 from .certificate import outside_percent
 from .channels import FAMILIES, Channels, channels_of
-from .gaps import with_gaps
+from .gaps import decay_of, with_gaps
 from .reduction import Filters, reduced
 from .regression import Design, Readout, Recordings, is_less, samples
 from .settings import EstimatorSettings
@@ -42,6 +42,7 @@ def identify_estimator(
     sample_period_s: float,
     parameters: Mapping[str, float] | None = None,
     settings: EstimatorSettings | None = None,
+    poles: Sequence[complex] = (),
 ) -> Identified:
     """Identify the estimator of a population.
 
@@ -58,6 +59,8 @@ def identify_estimator(
     parameters : mapping of str to float, optional
         Default values of the lifting's parameters.
     settings : EstimatorSettings, optional
+    poles : sequence of complex, optional
+        Of a model of the machines: those with an imaginary part become filters of the inputs alone, for gaps.
 
     Returns
     -------
@@ -81,7 +84,7 @@ def identify_estimator(
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(measured)
     require_known(settings.unbounded, [lifting.states[i] for i in measured], inputs)
-    readout, blind, family = best_family(lifting, measured, inputs, recordings, settings, hidden)
+    readout, blind, family = best_family(lifting, measured, inputs, recordings, settings, hidden, poles)
     channels = readout.design.channels
     held = [measured[i] for i in blind.design.channels.held]
     reach = settings.reach * recordings.size[list(measured)]
@@ -95,8 +98,10 @@ def identify_estimator(
     group, unseen = readout.left_out_group()
     orders = len(filters.A), len(fallback.A)
     trial = observer_of(*(reduced(r.without(group), fine, n) for (r, fine), n in zip(pairs, orders, strict=True)))
+    F = decay_of(observer, recordings, settings, held)
+    observer, trial = let_go(observer, F), let_go(trial, F)
     assert observer.bank is not None
-    bank = with_gaps(observer.bank, trial, unseen, settings, held)
+    bank = with_gaps(observer.bank, trial, unseen, settings)
     observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings))
     states = lifting.states
 
@@ -152,6 +157,7 @@ def best_family(
     recordings: Recordings,
     settings: EstimatorSettings,
     hidden: Sequence[int],
+    poles: Sequence[complex] = (),
 ) -> tuple[Readout, Readout, str]:
     """Return the readout of the family that is better by the margin on left-out units than the simpler ones.
 
@@ -167,7 +173,8 @@ def best_family(
         return Design.of(channels_of(lifting, measured, inputs, family, ranges, settings), recordings, settings)
 
     plain = [design(family) for family in FAMILIES[:-1]]
-    *readouts, blind = Readout.of([*plain, Design.of(plain[0].channels.without_measurements(), recordings, settings)])
+    without = Design.of(plain[0].channels.without_measurements(), recordings, settings, poles)
+    *readouts, blind = Readout.of([*plain, without])
     families = dict(zip(FAMILIES, readouts, strict=False))
 
     def better(family: str, other: str) -> str:
@@ -197,11 +204,12 @@ def assembled(
     n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
     bare = channels.lifting
     own = [*(f"filter_{i + 1}" for i in range(r)), *(f"input_filter_{i + 1}" for i in range(s))]
-    widened = replace(bare, states=(*bare.states, *own, *(f"{state}_from_inputs" for state in bare.states)))
+    own += [f"{state}_{what}" for what in ("from_inputs", "offset_from_inputs") for state in bare.states]
+    widened = replace(bare, states=(*bare.states, *own))
     total, columns = widened.n_states, widened.n_lifted + len(inputs) + len(bare.input_functions)
     places = [c if c < n else c + total - n for c in channels.columns]
     blind = [c + total - n for c in without.columns]
-    z, w, u = (np.arange(a, b) for a, b in ((n, n + r), (n + r, n + r + s), (n + r + s, total)))
+    z, w, u = (np.arange(a, b) for a, b in ((n, n + r), (n + r, n + r + s), (n + r + s, total - n)))
     x, at = np.arange(n), list(channels.measured)
     model, start = np.zeros((total, columns)), np.zeros((total, columns))
     first = filters.C @ filters.S + filters.D  # as if nothing had moved before: no step at the start
@@ -217,7 +225,7 @@ def assembled(
     model[u[held], held] = 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
-    bank = FilterBank(r, start, np.ones(n), np.ones(n), np.zeros(n), reach)
+    bank = FilterBank(r, start, np.ones(n), np.zeros(n), reach)
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(
@@ -233,6 +241,13 @@ def assembled(
         own_values,
         bank=bank,
     )
+
+
+def let_go(observer: Observer, F: Array) -> Observer:
+    """Return an observer whose distance from the estimates of inputs alone decays by F (n, n)."""
+    A, last = observer.A.copy(), slice(observer.lifting.n_states - len(F), observer.lifting.n_states)
+    A[last, last] = F
+    return replace(observer, A=A)
 
 
 def settle_samples(systems: Sequence[Filters], recovery: Array) -> int:

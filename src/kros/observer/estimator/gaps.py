@@ -1,4 +1,4 @@
-"""What training says of gaps: how fast the fallback forgets, and from which age on it is better than the filters."""
+"""What training says of gaps: how machines move that are let go, and from which age on the fallback is better."""
 
 from __future__ import annotations
 
@@ -36,17 +36,31 @@ def training(
     return states, y, inputs, {k: np.concatenate([b.parameters[k] for b in batches])[again] for k in names}
 
 
-def forgetting(apart: Array) -> Array:
-    """Return the factors (n,) by which distances (n_samples, batch, n) from the estimate of inputs alone decay."""
-    lags = np.unique(np.geomspace(1, max(2, len(apart) // 4), 12).round().astype(int))
-    rhos = np.append(np.exp(-1 / np.geomspace(1, 4 * len(apart), 40)), 1.0)
-    score = np.zeros((len(rhos), apart.shape[-1]))
-    for lag in lags:
-        now, later = apart[:-lag], apart[lag:]
-        a, b, c = (np.mean(x, axis=(0, 1)) for x in (later * later, later * now, now * now))
-        error = a - 2 * np.outer(rhos**lag, b) + np.outer(rhos ** (2 * lag), c)
-        score += np.log(np.maximum(error, TINY))
-    return rhos[np.argmin(score, axis=0)]
+def decay(apart: Array, judged: Sequence[int]) -> Array:
+    """Return the stable matrix F (n, n) by which distances (n_samples, batch, n) from the fallback's input part decay.
+
+    Of a factor for every state and of roots of regressions over several lags, it is what predicts some states best over
+    all of these lags.
+    """
+    n, longest = apart.shape[-1], 4 * len(apart)
+    lags = np.unique(np.geomspace(1, max(2, len(apart) // 4), 12).round().astype(int)).tolist()
+    pairs = [(apart[lag:].reshape(-1, n), apart[:-lag].reshape(-1, n)) for lag in lags]
+    moments = [[one.T @ other / len(one) for one, other in ((a, a), (a, b), (b, b))] for a, b in pairs]
+
+    def missed(F: Array) -> Array:
+        powers = [np.linalg.matrix_power(F, lag) for lag in lags]
+        left = [np.diag(a - 2 * b @ P.T + P @ c @ P.T) for P, (a, b, c) in zip(powers, moments, strict=True)]
+        return np.log(np.maximum(left, TINY)).sum(axis=0)
+
+    factors = np.append(np.exp(-1 / np.geomspace(1, longest, 40)), 1.0)
+    best = np.argmin([missed(rho * np.eye(n)) for rho in factors], axis=0)
+    found = [np.diag(factors[best])]
+    for lag, (_, later, now) in zip(lags, moments, strict=True):
+        values, modes = np.linalg.eig(later @ np.linalg.pinv(now, hermitian=True))
+        roots = np.where((values.imag == 0) & (values.real < 0), 0.0, values) ** (1 / lag)  # gone within the lag
+        roots *= np.minimum(1, np.exp(-1 / longest) / np.maximum(abs(roots), TINY))
+        found.append((modes * roots @ np.linalg.pinv(modes)).real)
+    return min(found, key=lambda F: missed(F)[judged].sum())
 
 
 def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
@@ -62,53 +76,65 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
     return missing
 
 
-def with_gaps(
-    bank: FilterBank, trial: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]
-) -> FilterBank:
-    """Return a filter bank with forgetting and ages of gaps that minimise a trial's errors under simulated losses.
+def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
+    """Return a filter bank with the ages of gaps that minimise a trial's errors under simulated losses.
 
     The trial does not know the recordings. Ages of measured states change what the filters see: some are tried side by
     side, with the best of the others for each. A larger one, with which the filters go on by themselves for longer, has
-    to be better by the margin. Fallbacks of states `held` go on from their last value by themselves.
+    to be better by the margin.
     """
     n, at = len(trial.recorded), list(trial.measured)
     states, y, inputs, parameters = training(recordings, at, settings)
     batch, own = states.shape[1], trial.own(parameters)
     hidden = [i for i in range(n) if i not in at]
+    judged = hidden or at
     missing = losses(np.random.default_rng(settings.seed), *y.shape[:2])
-    forget = forgetting(states - recorded_estimates(trial, y, inputs, own)[..., n:])
-    forget[list(held)] = 0.0
+    last = slice(trial.lifting.n_states - n, trial.lifting.n_states)
+    F = trial.A[last, last]
     longest = settings.blocks(recordings.length)[-1]
     halves, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     tried = halves[::2]
     ages = np.full((len(tried), batch, n), _NEVER)
     ages[..., at] = tried[:, None, None]
     assert trial.bank is not None
-    side = replace(trial.bank, forget=forget, half=ages.reshape(-1, n), recovery=np.zeros(n))
+    side = replace(trial.bank, half=ages.reshape(-1, n), recovery=np.zeros(n))
     shown, u = (np.tile(s, (1, len(tried), 1)) for s in (np.where(missing[..., None], np.nan, y), inputs))
     several = {name: np.tile(values, len(tried)) for name, values in own.items()}
-    estimates = recorded_estimates(replace(trial, bank=side), shown, u, several)
+    filtered, from_inputs = np.split(recorded_estimates(replace(trial, bank=side), shown, u, several), 2, axis=-1)
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(halves, recoveries))
-    some = hidden or at
-    truth, lost = np.tile(states[..., some], (1, len(tried), 1)), np.tile(missing, (1, len(tried)))
-    filtered, fallback = (np.ascontiguousarray(part[..., some]) for part in (estimates[..., :n], estimates[..., n:]))
-    every = blended_errors(truth, filtered, fallback, lost, forget[some], T, mu)
+    truth, lost = np.tile(states, (1, len(tried), 1)), np.tile(missing, (1, len(tried)))
+    others = [i for i in at if i not in judged]
+    substituted = np.where(lost[..., None], filtered[..., others] - truth[..., others], 0.0)
+    filtered[..., others] = truth[..., others]
+    every = blended_errors(truth, filtered, from_inputs, lost, F, judged, T, mu)
+    by_state = np.log(np.mean(substituted**2, axis=0) + TINY)
     least, best = np.full(batch, np.inf), bank
-    for age, errors in zip(tried, np.split(every, len(tried), axis=1), strict=True):
+    for i, age in enumerate(tried):
+        errors, known = every[:, i * batch : (i + 1) * batch], by_state[i * batch : (i + 1) * batch]
         choice = earliest(errors, T[:, 0], settings.margin)
-        score = errors[choice, :, range(len(some))].mean(axis=0)
+        score = np.vstack([errors[choice, :, range(len(judged))], known.T]).mean(axis=0)
         if age == tried[0] or is_less(score, least, settings.margin):
             half, recovery = np.full(n, age), np.zeros(n)
             if hidden:
                 half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
-            least, best = score, replace(bank, forget=forget, half=half, recovery=recovery)
+            least, best = score, replace(bank, half=half, recovery=recovery)
     return best
 
 
+def decay_of(observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]) -> Array:
+    """Return by which matrix distances from the estimates of inputs alone decay; states `held` go on from their last."""
+    n, at = len(observer.recorded), list(observer.measured)
+    states, y, inputs, parameters = training(recordings, at, settings)
+    from_inputs = recorded_estimates(observer, y, inputs, observer.own(parameters))[..., n:]
+    F = decay(states - from_inputs, [i for i in range(n) if i not in at] or at)
+    F[held], F[:, held] = 0.0, 0.0
+    return F
+
+
 def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Parameters) -> Array:
-    """Return the estimates and the fallback of recorded states, (n_samples, batch, 2 n), without the filters."""
+    """Return the estimates of recorded states and those from inputs alone, (n_samples, batch, 2 n)."""
     course, n = Course(observer, y.shape[1], parameters), len(observer.recorded)
-    some = [*range(n), *range(-n, 0)]
+    some = [*range(n), *range(-2 * n, -n)]
     starts = range(0, len(y), _ROWS)
     return np.concatenate([course.take(y[k : k + _ROWS], u[k : k + _ROWS]).estimates[..., some] for k in starts])
 
@@ -124,19 +150,30 @@ def earliest(errors: Array, half: Array, margin: float) -> Whole:
 
 
 def blended_errors(
-    states: Array, filtered: Array, from_inputs: Array, missing: Flags, forget: Array, half: Array, recovery: Array
+    states: Array,
+    filtered: Array,
+    from_inputs: Array,
+    missing: Flags,
+    F: Array,
+    judged: Sequence[int],
+    half: Array,
+    recovery: Array,
 ) -> Array:
-    """Return log squared errors (c, batch, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
-    count, age = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1]))
-    offset = np.repeat((filtered - from_inputs)[:1], len(half), axis=0)
-    x, level, squares = offset + from_inputs[0], *np.zeros((2, *offset.shape))
+    """Return log squared errors (c, batch, judged) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
+    count, age, fading = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1])), np.zeros(len(F), bool)
+    fading[judged] = True
+    x, level, squares = (
+        np.repeat(filtered[:1], len(half), axis=0),
+        np.zeros((*age.shape, 1)),
+        np.zeros_like(filtered[:1]),
+    )
+    offset = x - from_inputs[0]
     for k, lost in enumerate(missing[:-1]):
+        share = np.where(lost[:, None], 1.0, fading * level)
+        offset = (offset + (1 - share) * (x - from_inputs[k] - offset)) @ F.T
         count = np.where(lost, count + 1, 0.0)
         age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)
-        apart = x - from_inputs[k]
-        offset = forget * (apart + level * (offset - apart))
         level = (age**2 / (age**2 + half**2))[..., None]
-        fallback = from_inputs[k + 1] + offset
-        x = filtered[k + 1] + level * (fallback - filtered[k + 1])
-        squares += (x - states[k + 1]) ** 2
-    return np.log(squares / len(missing) + TINY)
+        x = filtered[k + 1] + fading * level * (from_inputs[k + 1] + offset - filtered[k + 1])
+        squares = squares + (x - states[k + 1]) ** 2
+    return np.log(squares[..., judged] / len(missing) + TINY)

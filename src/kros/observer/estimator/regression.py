@@ -151,9 +151,11 @@ class Design:
     shown: Shown = interpolated
 
     @classmethod
-    def of(cls, channels: Channels, recordings: Recordings, settings: EstimatorSettings) -> Design:
-        """Return the design with the bank of its channels."""
-        return cls(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
+    def of(
+        cls, channels: Channels, recordings: Recordings, settings: EstimatorSettings, poles: Sequence[complex] = ()
+    ) -> Design:
+        """Return the design with the bank of its channels, and of poles of the machines."""
+        return cls(channels, Bank.of(channels, recordings.length, settings, poles), recordings, settings)
 
     def rows(self, recordings: Recordings, rows: int) -> Iterator[Rows]:
         """Yield episode, bank rows, targets and weights of every episode, with measurements as they are shown.

@@ -220,7 +220,7 @@ def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) ->
         return None, str(error)
 
 
-def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> Record:
+def certificate(task: DesignTask, design: Design) -> Record:
     """Return what holds for an observer on every member of the set."""
     observer = design.observer
     order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
@@ -228,9 +228,9 @@ def certificate(task: DesignTask, design: Design, problem: ObserverProblem | Non
     if design.facts.get("rows_fitted_to_single_steps"):
         reason = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
         return facts | {"reason": reason}
-    if problem is None:
+    if task.problem is None:
         return facts | {"reason": task.refusal}
-    problem = replace(problem, injection=design.synthesis.injection)
+    problem = replace(task.problem, injection=design.synthesis.injection)
     try:
         errors, mean = error_maps(task, design, problem)
         facts["spectral_radius_max"] = float(max(errors.spectral_radius(), task.models.spectral_radius().max()))

@@ -113,8 +113,7 @@ def synthesize(
         every = synthesize_all(uncertain, options, compared, regression, sensors, work=work)
         return every.designs[every.deployed]
     kind, chosen = _named(uncertain, method, regression)
-    beside = [m for m in methods_of(options.methods, regression) if m.assumes_disturbances and m.name != chosen.name]
-    tasks, work = tasks_of(uncertain, kind, [*beside, chosen], sensors), work or Work()
+    tasks, work = tasks_of(uncertain, kind, [chosen], sensors), work or Work()
     designs, failed = _designed(tasks, work)
     name = f"{kind}/{chosen.name}"
     if name in failed:
@@ -217,14 +216,13 @@ def _design(task: DesignTask) -> Design | str:
 def certified(
     tasks: Sequence[DesignTask], designs: Mapping[str, Design], identified: IdentifiedModels, work: Work
 ) -> dict[str, Design]:
-    """Certify observers as nonlinear ones, a lifting side by side, and on the set with disturbances a method chose."""
+    """Certify observers as nonlinear ones, a lifting side by side, and on the set."""
     pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
     groups = dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]]()
     for task, design in pairs:
         groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
-    chosen = {task.models.name: design.problem for task, design in reversed(pairs) if design.problem is not None}
-    linear = [partial(certificate, task, design, chosen.get(task.models.name, task.problem)) for task, design in pairs]
+    linear = [partial(certificate, task, design) for task, design in pairs]
     results: list[Any] = work.run("certify", [*nonlinear, *linear])  # the first ones take longest
     by_name = {design.name: design for design in chain(*results[: len(nonlinear)])}
     final = {}

@@ -35,7 +35,6 @@ class Method(ABC):
 
     name: ClassVar[str]
     label: ClassVar[Label]
-    assumes_disturbances: ClassVar[bool] = False  # chooses those that all observers of its models are certified for
 
     def refusal(self, kind: str) -> str:
         """Return why the method is not used for a kind of model; empty where it is."""
@@ -60,8 +59,6 @@ class Design(Shown):
         What the metrics of a study say.
     certificate : ReliftCertificate or None
         Of the nonlinear observer that is deployed; its `certified` says whether it holds.
-    problem : ObserverProblem or None
-        The uncertain set with the disturbances that the method assumed, where these are its own.
 
     Examples
     --------
@@ -78,7 +75,6 @@ class Design(Shown):
     synthesis: Synthesis
     facts: ByName = field(default_factory=dict)
     certificate: ReliftCertificate | None = None
-    problem: ObserverProblem | None = None
 
     def __repr__(self) -> str:
         percent, known = self.facts.get("hidden_error_percent"), "certified" if self.certified else "not certified"
@@ -157,9 +153,9 @@ class DesignTask:
             sensor=self.sensor,
         )
 
-    def designed(self, synthesis: Synthesis, problem: ObserverProblem | None = None, **facts: Any) -> Design:
+    def designed(self, synthesis: Synthesis, **facts: Any) -> Design:
         """Return the design of a synthesis that corrects the nominal model."""
-        return Design(self.name, self.observer(synthesis), synthesis, facts, problem=problem)
+        return Design(self.name, self.observer(synthesis), synthesis, facts)
 
     @property
     def sensor(self) -> Sensors:

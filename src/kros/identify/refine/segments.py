@@ -103,7 +103,7 @@ def read_segments(
     for row, (unit, episodes) in enumerate(keys.items()):
         if not episodes:
             raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out.")
-        rng = np.random.default_rng([seed, row])
+        rng = np.random.default_rng(seed)  # as for any other unit: their order does not matter
         earlier, held = max(1, len(episodes) - 1), held_segments(count, keys)
         owners = np.array([*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held])
         for episode in dict.fromkeys(owners.tolist()):

@@ -24,10 +24,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core import StateSpace, SynthesisError, block_diagonal
+from ...core import StateSpace, block_diagonal
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import shaped_plant
-from ..result import Injection, Status, Synthesis, enclosed
+from ..result import Injection, Synthesis, enclosed
 from ..riccati.h2 import predictor
 from .certificate import certified
 from .disturbance import average_disturbance
@@ -39,7 +39,6 @@ def worst_case_h2(
     *,
     max_order: int = 4,
     tolerance_db: float = 1.0,
-    bounded: bool = True,
 ) -> Synthesis:
     """Return an observer filter with a certified H2 norm for every member of the uncertain set.
 
@@ -51,9 +50,6 @@ def worst_case_h2(
         Highest order of each shaping filter; the smallest within `tolerance_db` is taken.
     tolerance_db : float, dB
         Accuracy of the shaping filters. It costs optimality, never validity: the certificate uses the set itself.
-    bounded : bool
-        False: only the design, neither certified nor bounded from below, for those who design many and compare them on
-        recordings.
 
     Returns
     -------
@@ -83,14 +79,6 @@ def worst_case_h2(
     start = time.perf_counter()
     controller = design(problem, *shaped)
     elapsed = time.perf_counter() - start
-    if not bounded:
-        radius = problem.error_system(controller).largest_pole()
-        if radius >= 1:
-            loop = f"the loop has spectral radius {radius:.9g}"
-            raise SynthesisError(f"Worst-case H2 synthesis: {loop}; add noise, or lower the order of the weights.")
-        about = Status.INACCURATE, problem.injection
-        alone = Synthesis("worst_case_h2", controller, *about, spectral_radius=radius, solver="riccati")
-        return replace(alone, notes=("A design alone, without certificate.",))
     candidates = [certified(problem, K, "worst_case_h2") for K in (problem.nothing, controller)]
     best = min(candidates, key=lambda candidate: candidate.worst_case_h2 or 0.0)
     lower, gap, notes = enclosed(best.worst_case_h2 or 0.0, lower_bound(problem))

@@ -190,7 +190,7 @@ def motors():
 def test_every_unit_of_a_population_is_below_its_bound(motors):
     task = tasks_of(motors, "linear", [Estimator(SETTINGS)])[0]
     result = task.method.design(task)
-    facts = certificate(task, result, task.problem)
+    facts = certificate(task, result)
     errors, mean = error_maps(task, result, task.problem)
     bound = certify_errors(task.problem, errors, mean)[0]
     assert facts["worst_case_h2_attained"] <= bound

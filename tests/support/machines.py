@@ -69,7 +69,9 @@ MACHINES = {
 def filters(functions=GEAR, cut=False):
     """A filter bank with two filters, one of inputs alone, and an age of gaps for every state."""
     parameters = ("phase",) if functions else ()
-    fallback = tuple(f"{name}_{what}" for what in ("from_inputs", "offset_from_inputs") for name in STATES)
+    fallback = tuple(
+        f"{name}_{what}" for what in ("after_start", "from_inputs", "offset_from_inputs") for name in STATES
+    )
     states = (*STATES, "filter_1", "filter_2", "input_filter_1", *fallback)
     lifting = Lifting(states, functions, parameters, ("target", "rate"), ("rate*position", "1"))
     rng, n, p = np.random.default_rng(3), lifting.n_states, lifting.n_lifted
@@ -79,12 +81,13 @@ def filters(functions=GEAR, cut=False):
     A[:5, 3:5] = [[0.1, 0.0], [0.5, 0.1], [0.0, 0.7], [0.9, 0.1], [-0.1, 0.9]]
     A[0, 0] += 1.0
     A[5, 5], B[5, [0, 1, 3]] = 0.95, [0.05, 0.01, 0.02]
-    A[6:9, 5], B[6:9, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
-    A[9:12, 9:12] = [[0.99, 0.05, 0.0], [-0.05, 0.9, 0.02], [0.0, 0.1, 0.5]]
+    A[6:9, [0, 3, 4]] = [[0.9, 0.2, 0.1], [0.0, 0.1, 0.2], [0.1, 0.0, 0.1]]
+    A[9:12, 5], B[9:12, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
+    A[12:15, 12:15] = [[0.99, 0.05, 0.0], [-0.05, 0.9, 0.02], [0.0, 0.1, 0.5]]
     start = 0.1 * rng.normal(size=(n, p + 4))
     start[:, 1:n] = 0.0  # states that are not measured are not known
-    start[9:12] = 0.0
-    ages = ([5.0, 8.0, 2.0], [0.8, 0.9, 0.99], [0.05])
+    start[12:15] = 0.0
+    ages = ([5.0, 8.0, 2.0], [0.8, 0.9, 0.99], [0.05, 0.4, 0.5], [0.95])
     bank = FilterBank(2, start, *map(np.array, ages))
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((p, 0)), np.zeros((p, 1)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))

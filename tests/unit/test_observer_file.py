@@ -141,12 +141,13 @@ def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> No
 
 def filters(**changes: Any) -> Observer:
     """A filter bank of one filter, and no filter of inputs."""
-    own = ("position_from_inputs", "position_offset_from_inputs")
+    own = ("position_after_start", "position_from_inputs", "position_offset_from_inputs")
     lifting = Lifting(("position", "filter_1", *own), (), (), ("torque",), ("1",))
-    bank = {"filters": 1, "start": np.ones((4, 6)), "half": np.ones(1), "recovery": np.ones(1), "reach": np.ones(1)}
-    none, made = gain(np.zeros((4, 1)), 0.01), FilterBank(**bank | changes)
+    ages = ("half", "recovery", "reach", "start_recovery")
+    bank = {"filters": 1, "start": np.ones((5, 7)), **dict.fromkeys(ages, np.ones(1))}
+    none, made = gain(np.zeros((5, 1)), 0.01), FilterBank(**bank | changes)
     return Observer(
-        "f", lifting, 0.5 * np.eye(4), np.ones((4, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=made
+        "f", lifting, 0.5 * np.eye(5), np.ones((5, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=made
     )
 
 
@@ -155,15 +156,16 @@ def test_a_filter_bank_goes_through_its_file(tmp_path: Path) -> None:
     loaded = Observer.load(tmp_path / "observer.json")
     assert loaded.bank is not None
     assert loaded.recorded == ("position",)
-    np.testing.assert_array_equal(loaded.bank.start, np.ones((4, 6)))
+    np.testing.assert_array_equal(loaded.bank.start, np.ones((5, 7)))
 
 
 @pytest.mark.parametrize(
     ("changes", "error", "match"),
     [
         ({"recovery": np.array([1.5])}, DataError, "between 0 and 1"),
+        ({"start_recovery": np.array([0.5, 0.5])}, DimensionError, "start_recovery"),
         ({"half": np.zeros(1)}, DataError, "half should be positive"),
-        ({"start": np.ones((2, 6))}, DimensionError, "start"),
+        ({"start": np.ones((2, 7))}, DimensionError, "start"),
         ({"filters": 4}, DimensionError, "at most 1 filters"),
     ],
 )
@@ -176,4 +178,4 @@ def test_a_filter_bank_that_does_not_fit_is_refused(
 
 def test_a_filter_bank_has_no_correction() -> None:
     with pytest.raises(DimensionError, match="has no correction"):
-        replace(filters(), controller=gain(np.ones((4, 1)), 0.01))
+        replace(filters(), controller=gain(np.ones((5, 1)), 0.01))

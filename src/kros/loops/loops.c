@@ -49,7 +49,7 @@ typedef struct {
     whole q;
     whole own;         /* every machine has a map of its own: one observer, map (batch, rows, columns) */
     whole fresh;       /* earlier values equal the present ones at the first sample */
-    whole recorded;    /* first states; the last ones are those from inputs alone, and how far apart they are; none */
+    whole recorded;    /* first states; the last ones are those after a start, those from inputs alone, and how far apart they are; none */
     whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
     const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
     const double *y;          /* (samples, q, batch); none where nothing is measured */
@@ -60,9 +60,9 @@ typedef struct {
     uint8_t *left;            /* (observers): whether a machine would leave the bounds; its numbers are then of no use */
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
     double *past;             /* (observers, batch, earlier), moved on */
-    const double *reach;      /* (q) */
-    const double *bank;       /* (3, recorded, batch): half, recovery, longest age */
-    double *gap;              /* (recorded + q + q filters, batch): age, count, ramps; moved on */
+    const double *reach;      /* (recorded) */
+    const double *bank;       /* (4, recorded, batch): half, recovery, longest age, recovery of a start */
+    double *gap;              /* (recorded + q + 1 + q filters, batch): age, count, age of the start, ramps; moved on */
     double *states;           /* (samples, observers, n, batch): x before every sample; none */
 } relift_job;
 
@@ -246,11 +246,11 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
         for (whole v = 0; v < w; v++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
             const vec seen = y[row], count = gap[recorded * MOST + row], held = from_inputs[i] + offset[i];
-            const vec reach = (1.0 - level(gap[i], bank[i])) * s->reach[j];
+            const vec reach = (1.0 - level(gap[i], bank[i])) * s->reach[s->measured[j]];
             const vec apart = reg[i] - held, near = either(apart < -reach, -reach, either(apart > reach, reach, apart));
             const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
-            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(recorded + s->q + j * r + l) * MOST + v] * jump;
+            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(recorded + s->q + 1 + j * r + l) * MOST + v] * jump;
             missing[row] = lost;
             reg[i] = y[row] = either(lost, held + near, seen);
         }
@@ -264,7 +264,9 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
                 if (s->measured[j] == i) own = missing[j * MOST + v], hidden = 0;
             }
             const vec share = either(hidden ? lost : own, (vec){0}, 1.0 - hidden * level(gap[at], bank[at]));
-            offset[at] += share * (reg[at] - from_inputs[at] - offset[at]);
+            const vec moved = offset[at] + share * (reg[at] - from_inputs[at] - offset[at]);
+            const double most = hidden ? s->reach[i] : INFINITY;
+            offset[at] = either(moved > most, (vec){0} + most, either(moved < -most, (vec){0} - most, moved));
         }
 }
 
@@ -277,7 +279,7 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
         vec longest = {0};
         for (whole j = 0; j < q; j++) {
             const mask lost = missing[j * MOST + v];
-            vec *count = gap + (recorded + j) * MOST + v, *of = gap + (recorded + q + j * r) * MOST + v;
+            vec *count = gap + (recorded + j) * MOST + v, *of = gap + (recorded + q + 1 + j * r) * MOST + v;
             const int moves = any(lost | (*count > 0.0));
             *count = either(lost, *count + 1.0, (vec){0});
             longest = either(*count > longest, *count, longest);
@@ -290,12 +292,16 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
             }
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
+        vec *start = gap + (recorded + q) * MOST + v;
+        const vec begun = *start * *start / (1.0 + *start * *start);
+        *start *= bank[3 * recorded * MOST + v];
         for (whole i = 0; i < recorded; i++) {
             const whole at = i * MOST + v;
             const vec half = bank[at], oldest = bank[2 * recorded * MOST + at], old = gap[at];
             const vec recovered = either(some, old, bank[recorded * MOST + at] * either(old > oldest, oldest, old));
             int hidden = 1;
             for (whole j = 0; j < q; j++) hidden &= s->measured[j] != i;
+            next[at] += begun * (next[(n - 3 * recorded) * MOST + at] - next[at]);
             gap[at] = either(longest > recovered, longest, recovered);
             if (hidden) next[at] += level(gap[at], half) * (next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at] - next[at]);
         }
@@ -305,8 +311,8 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? recorded + q + q * s->filters : 0;
-    vec *bank = vectors(3 * recorded), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? recorded + q + 1 + q * s->filters : 0;
+    vec *bank = vectors(4 * recorded), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;
     const whole groups = (rows + 3) / 4;
@@ -319,7 +325,7 @@ int kros_relift(const formulas *f, const relift_job *s)
         settle(f, reg, first, batch, lanes);
         if (s->own)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
-        for (whole i = 0; i < 3 * recorded; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
+        for (whole i = 0; i < 4 * recorded; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
         for (whole i = 0; i < gaps; i++) gather(gap + i * MOST, s->gap + i * batch + first, 1, lanes);
         for (whole o = 0; o < s->observers; o++) {
             double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;

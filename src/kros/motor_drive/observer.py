@@ -67,7 +67,7 @@ def load_observer(
     recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
     lag = settings.level_s / batch.sample_period_s
     bank = {"dense": settings.delays, "longest": settings.delays}
-    lags = {"first_lag": lag, "last_lag": lag / recordings.length, "start_trust": (settings.start_trust,)}
+    lags = {"first_lag": lag, "last_lag": lag / recordings.length, "start_trust": settings.start_trust}
     estimator = EstimatorSettings(**bank, **lags)
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     result = identify_estimator(

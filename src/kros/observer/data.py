@@ -132,8 +132,11 @@ class ObserverData:
         if self.bank is not None:
             bank, recorded = self.bank, (len(self.recorded),)
             shapes = bank.start.shape, bank.half.shape[-1:], bank.recovery.shape, bank.reach.shape
-            self._require("start, half, recovery and reach", shapes, ((n, rows + columns), recorded, recorded, (q,)))
-            if not 0 <= bank.filters <= (most := n - 3 * recorded[0]):
+            self._require(
+                "start, half, recovery and reach", shapes, ((n, rows + columns), recorded, recorded, recorded)
+            )
+            self._require("start_recovery", bank.start_recovery.shape, (1,))
+            if not 0 <= bank.filters <= (most := n - 4 * recorded[0]):
                 raise DimensionError(
                     f"Observer {self.name}: its states leave at most {most} filters of measurements, found "
                     f"{bank.filters}."

@@ -1,7 +1,8 @@
 r"""What makes an observer a filter bank: how it starts, and what replaces missing measurements.
 
 While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its
-internal states are the filters z of measurements and inputs, whose estimate is given then, the filters w of inputs
+internal states are the filters z of measurements and inputs, whose estimate is given then, a second estimate
+:math:`x^s` from these for the time after a start, the filters w of inputs
 alone, their own estimate :math:`x^u` of all recorded states, and the distance o from it, which decays as machines do by
 themselves. Before a step
 
@@ -18,8 +19,12 @@ constants of :math:`\mu`. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
-A missing measurement is replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback: what
-the filters see is bounded for any pattern of losses, and so are they. When a measurement returns, the gap is bridged
+After a start, what happened before is not known. There :math:`x + m (x^s - x)` takes the place of x, with an age that
+falls from :math:`0.1 e^5 T` on as the slowest filter forgets, and T = 1.
+
+A missing measurement is replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback, and o of
+states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so
+are they. When a measurement returns, the gap is bridged
 by a straight line: the response r of the filters to a unit ramp was run along, and ``z`` is corrected by
 :math:`r (y - \hat y) / (g + 1)` after g samples.
 """
@@ -43,10 +48,12 @@ class FilterBank:
     half: Array
     recovery: Array
     reach: Array
+    start_recovery: Array
 
     def __post_init__(self) -> None:
         kinds = {"start": "finite numbers", "half": "positive and finite", "reach": "finite and not negative"}
-        floats(self, "Filter bank", recovery="shares between 0 and 1", **kinds)
+        shares = dict.fromkeys(("recovery", "start_recovery"), "shares between 0 and 1")
+        floats(self, "Filter bank", **shares, **kinds)
 
     def level(self, age: Array) -> Array:
         """Return m of every recorded state at ages, shape (..., n)."""
@@ -66,27 +73,29 @@ class Gaps:
         n, q = len(A), len(measured)
         self.bank, self.measured, self.recorded = bank, list(measured), recorded
         self.filters = slice(recorded, recorded + bank.filters)
-        self.from_inputs, self.offset = slice(n - 2 * recorded, n - recorded), slice(n - recorded, n)
+        self.begun, self.from_inputs, self.offset = (slice(n - k * recorded, n - (k - 1) * recorded) for k in (3, 2, 1))
         self._A, self._B = A[self.filters, self.filters], A[self.filters, :][:, self.measured]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
-        self.take(np.zeros((recorded + q + q * bank.filters, batch)))
+        self._most = np.where(self.hidden, bank.reach, np.inf)
+        self.take(np.zeros((recorded + q + 1 + q * bank.filters, batch)))
 
     def take(self, state: Array) -> None:
-        """Go on from a state whose rows are ages, counts and ramps of all machines."""
+        """Go on from a state whose rows are ages, counts, the age of the start and ramps of all machines."""
         n, q = self.recorded, len(self.measured)
         self.state = state
-        self.age, self.count, ramp = np.split(state.T, [n, n + q], axis=1)
+        self.age, self.count, self.start, ramp = np.split(state.T, [n, n + q, n + q + 1], axis=1)
         self.ramp = ramp.reshape(len(ramp), q, -1).swapaxes(1, 2)
 
     def begin(self, rows: Any) -> None:
         """Start some machines: nothing is missing."""
         self.state[:, rows] = 0.0
+        self.start[rows] = longest_age(np.ones(1))
 
     def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
         level, recorded, offset = self.bank.level(self.age), x[:, : self.recorded], x[:, self.offset]
         if missing.any() or self.count.any():
-            reach = (1 - level[:, self.measured]) * self.bank.reach
+            reach = (1 - level[:, self.measured]) * self.bank.reach[self.measured]
             held = (x[:, self.from_inputs] + offset)[:, self.measured]
             expected = held + np.clip(x[:, self.measured] - held, -reach, reach)
             ends = ~missing & (self.count > 0)
@@ -98,6 +107,7 @@ class Gaps:
         level[missing.any(axis=1)] = 1.0
         level[:, self.measured] = missing
         offset += (1 - level) * (recorded - x[:, self.from_inputs] - offset)
+        np.clip(offset, -self._most, self._most, out=offset)
 
     def follow(self, following: Array, missing: Flags) -> None:
         """Blend the fallback into the next states (batch, n) and move ages and ramps on."""
@@ -106,17 +116,18 @@ class Gaps:
         recovered = np.where(some[:, None], self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
         age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
+        recorded += self.start**2 / (1 + self.start**2) * (following[:, self.begun] - recorded)
         recorded += self.hidden * bank.level(age) * (fallback - recorded)
         if some.any() or self.count.any():
             ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
             self.ramp[...] = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)
-        self.age[...], self.count[...] = age, count
+        self.age[...], self.count[...], self.start[...] = age, count, self.start * bank.start_recovery
 
     @property
     def job(self) -> Record:
         """What the compiled loop needs of gaps."""
         bank = self.bank
-        rows = bank.half, bank.recovery, longest_age(bank.half)
+        rows = bank.half, bank.recovery, longest_age(bank.half), bank.start_recovery
         return {
             "recorded": self.recorded,
             "filters": bank.filters,

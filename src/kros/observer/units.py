@@ -31,7 +31,7 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     by: dict[str, dict[str, Array]] = {
         "seen": {"measured": y, "inputs": u[: len(observer.inputs)]},
         "monitor": {"size": y},
-        "bank": {"start": x[: lifting.n_states, None] / np.concatenate([x, u]), "reach": y},
+        "bank": {"start": x[: lifting.n_states, None] / np.concatenate([x, u]), "reach": x[: len(observer.recorded)]},
         "guard": dict.fromkeys(("lower", "upper"), x[: lifting.n_states]),
         "runtime": dict.fromkeys(observer.runtime.by_state(), x[: lifting.n_states]),
     }
@@ -57,7 +57,7 @@ def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, 
     x, u = (old.sizes_of(names) / new.sizes_of(names) for names in (old.names, inputs))
     if observer.bank is not None:  # its last states have the units of the recorded ones
         n, recorded = old.n_states, len(observer.recorded)
-        x[n - 2 * recorded : n] = np.tile(x[:recorded], 2)
+        x[n - 3 * recorded : n] = np.tile(x[:recorded], 3)
     return x, u
 
 

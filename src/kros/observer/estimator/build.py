@@ -16,8 +16,8 @@ from ..filter_bank import FilterBank
 from ..observer import Observer
 from ..runtime import Runtime
 from .certificate import outside_percent
-from .channels import FAMILIES, Channels, channels_of
-from .gaps import decay_of, with_gaps
+from .channels import FAMILIES, channels_of
+from .gaps import decay_of, loss_growth, with_gaps
 from .reduction import Filters, reduced
 from .regression import Design, Readout, Recordings, is_less, samples
 from .settings import EstimatorSettings
@@ -85,23 +85,32 @@ def identify_estimator(
     hidden = [i for i in range(n) if i not in measured] or list(measured)
     require_known(settings.unbounded, [lifting.states[i] for i in measured], inputs)
     readout, blind, family = best_family(lifting, measured, inputs, recordings, settings, hidden, poles)
-    channels = readout.design.channels
     held = [measured[i] for i in blind.design.channels.held]
-    reach = settings.reach * recordings.size[list(measured)]
 
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
-        return assembled(name, lifting, inputs, channels, (filters, fallback), sample_period_s, parameters or {}, reach)
+        return assembled(name, lifting, inputs, readout.design, (filters, fallback), sample_period_s, parameters or {})
 
-    pairs = list(zip((readout, blind), samples([readout.design.fine, blind.design.fine]), strict=True))
-    filters, fallback = (reduced(*pair, settings.order) for pair in pairs)
+    fine, blind_fine = samples([readout.design.fine, blind.design.fine])
+
+    def filters_of(one: Readout, other: Readout, orders: Sequence[int | None]) -> tuple[Filters, Filters]:
+        both = np.hstack([one.coefficients, one.begun])
+        return reduced(one, fine, orders[0], both), reduced(other, blind_fine, orders[1])
+
+    filters, fallback = filters_of(readout, blind, [settings.order] * 2)
     observer = observer_of(filters, fallback)
     group, unseen = readout.left_out_group()
     orders = len(filters.A), len(fallback.A)
-    trial = observer_of(*(reduced(r.without(group), fine, n) for (r, fine), n in zip(pairs, orders, strict=True)))
+    trial = observer_of(*filters_of(readout.without(group), blind.without(group), orders))
     F = decay_of(observer, recordings, settings, held)
     observer, trial = let_go(observer, F), let_go(trial, F)
     assert observer.bank is not None
+    assert trial.bank is not None
     bank = with_gaps(observer.bank, trial, unseen, settings)
+    trial = replace(trial, bank=replace(bank, start=trial.bank.start))
+    if 0 < settings.gap_share < 1 and loss_growth(trial, unseen, settings) > settings.lost_growth:
+        heavier = settings.model_copy(update={"gap_share": 10 * settings.gap_share})
+        same = name, lifting, measured, inputs, recordings, sample_period_s, parameters
+        return identify_estimator(*same, heavier, poles)
     observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings))
     states = lifting.states
 
@@ -114,6 +123,7 @@ def identify_estimator(
     facts = {
         "channels": family,
         "filters": len(filters.A),
+        "gap_share": settings.gap_share,
         "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
@@ -192,30 +202,31 @@ def assembled(
     name: str,
     lifting: Lifting,
     inputs: Sequence[str],
-    channels: Channels,
+    design: Design,
     systems: tuple[Filters, Filters],
     sample_period_s: float,
     parameters: Mapping[str, float],
-    reach: Array,
 ) -> Observer:
     """Write filters with their readouts, and those of inputs alone, into the model of an observer."""
-    without = channels.without_measurements()
+    channels, bank = design.channels, design.bank
+    without, slowest = channels.without_measurements(), max([*bank.lags, bank.taps[-1]])
     filters, fallback = systems[0].absolute(channels), systems[1].absolute(without)
     n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
     bare = channels.lifting
     own = [*(f"filter_{i + 1}" for i in range(r)), *(f"input_filter_{i + 1}" for i in range(s))]
-    own += [f"{state}_{what}" for what in ("from_inputs", "offset_from_inputs") for state in bare.states]
+    own += [f"{state}_{what}" for what in ("after_start", "from_inputs", "offset_from_inputs") for state in bare.states]
     widened = replace(bare, states=(*bare.states, *own))
     total, columns = widened.n_states, widened.n_lifted + len(inputs) + len(bare.input_functions)
     places = [c if c < n else c + total - n for c in channels.columns]
     blind = [c + total - n for c in without.columns]
-    z, w, u = (np.arange(a, b) for a, b in ((n, n + r), (n + r, n + r + s), (n + r + s, total - n)))
+    z, w, f, u = np.split(np.arange(n, total - n), np.cumsum([r, s, n]))
     x, at = np.arange(n), list(channels.measured)
     model, start = np.zeros((total, columns)), np.zeros((total, columns))
-    first = filters.C @ filters.S + filters.D  # as if nothing had moved before: no step at the start
+    first = (filters.C @ filters.S + filters.D)[n:]  # as if nothing had moved before: no step at the start
     first[at] = np.eye(len(at), len(channels))
     for rows, states, inputs_of, *system in (
-        (x, z, places, filters.C, filters.D, first),
+        (x, z, places, filters.C[:n], filters.D[:n], first),
+        (f, z, places, filters.C[n:], filters.D[n:], first),
         (z, z, places, filters.A, filters.B, filters.S),
         (w, w, blind, fallback.A, fallback.B, fallback.S),
         (u, w, blind, fallback.C, fallback.D, fallback.C @ fallback.S + fallback.D),
@@ -225,7 +236,9 @@ def assembled(
     model[u[held], held] = 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
-    bank = FilterBank(r, start, np.ones(n), np.zeros(n), reach)
+    low, high = (end[:n] for end in design.recordings.ranges)
+    reach = np.where(np.isin(x, at), design.settings.reach * design.recordings.size, high - low)
+    gaps = FilterBank(r, start, np.ones(n), np.zeros(n), reach, np.exp([-1 / slowest]))
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(
@@ -239,7 +252,7 @@ def assembled(
         Injection.STATE,
         sample_period_s,
         own_values,
-        bank=bank,
+        bank=gaps,
     )
 
 

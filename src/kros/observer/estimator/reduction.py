@@ -61,7 +61,7 @@ class Filters:
         """Return the filters of channels v, where these are of what ``channels.filtered(v)`` returns."""
         N, E = channels.relative
         D = self.D @ N
-        D[list(channels.measured)] += channels.reference
+        D.reshape(-1, channels.lifting.n_states, len(channels))[:, channels.measured] += channels.reference
         k = E.shape[1]
         A = np.block([[np.zeros((k, k + len(self.A)))], [-self.B @ E, self.A]])
         B, S = np.vstack([E.T, self.B @ N]), np.vstack([E.T, self.S @ (N - E @ E.T)])
@@ -73,15 +73,20 @@ class Filters:
         return z @ self.C.T + v @ self.D.T
 
 
-def reduced(readout: Readout, fine: tuple[Array, Array], order: int | None = None) -> Filters:
+def reduced(
+    readout: Readout, fine: tuple[Array, Array], order: int | None = None, coefficients: Array | None = None
+) -> Filters:
     """Return the filters of a readout, reduced until left-out errors grow by a share, or to an order.
 
-    The covariance is that of thinned rows of the bank with every delay, with their weights.
+    The covariance is that of thinned rows of the bank with every delay, with their weights. Other coefficients may take
+    the place of the readout's, for the states once or more.
     """
-    design = readout.design
+    design, coefficients = readout.design, readout.coefficients if coefficients is None else coefficients
     errors = readout.typical * design.recordings.size
+    errors[list(design.channels.measured)] *= design.settings.measured_loss
+    errors = np.tile(errors, coefficients.shape[1] // len(errors))
     A, B, S = design.bank.fine.system()
-    weights = design.bank.refined(readout.coefficients).T
+    weights = design.bank.refined(coefficients).T
     X, w = fine
     size = np.sqrt(w @ (X * X))
     size = np.where(size > 0, size, 1.0)
@@ -89,7 +94,6 @@ def reduced(readout: Readout, fine: tuple[Array, Array], order: int | None = Non
     C = weights * size @ A
     D = weights * size @ B
     used = np.isfinite(errors) & (errors > 0)
-    errors[list(design.channels.measured)] *= design.settings.measured_loss
     root = gramian_root(A.T, (C[used] / errors[used, None]).T).T
     _, values, U = np.linalg.svd(root, full_matrices=False)
     kept = values > EPS * values[0]
@@ -102,7 +106,7 @@ def reduced(readout: Readout, fine: tuple[Array, Array], order: int | None = Non
         return whole.first(order).modal()
     signals = design.signals(some=_EPISODES, length=round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
     every, most = np.arange(len(signals)), 2 * design.settings.loss
-    wanted = np.stack([design.bank.rows(v, every) @ readout.coefficients for v in signals.swapaxes(0, 1)], axis=1)
+    wanted = np.stack([design.bank.rows(v, every) @ coefficients for v in signals.swapaxes(0, 1)], axis=1)
 
     def enough(order: int) -> bool:
         missed = (whole.first(order).along(signals) - wanted)[..., used] / errors[used]

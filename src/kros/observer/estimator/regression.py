@@ -149,6 +149,8 @@ class Design:
     recordings: Recordings
     settings: EstimatorSettings
     shown: Shown = interpolated
+    late: bool = False  # whether rows are of samples after a random one of every episode
+    fresh: bool = True  # whether the bank starts there, too
 
     @classmethod
     def of(
@@ -164,9 +166,20 @@ class Design:
         """
         first = round(self.settings.start_rows * max(self.settings.start, default=0.0))
         samples = thinned(recordings.lengths, rows, first)
-        measured = list(self.channels.measured)
+        measured, rng = list(self.channels.measured), np.random.default_rng(self.settings.seed)
         for key, (at, weights) in zip(recordings.keys, samples, strict=True):
             states, y, v = self.episode(recordings.read(key))
+            if self.late:
+                begin = int(rng.integers(0, len(v) // 2))
+                after = np.minimum(at, len(v) - begin - 1)
+                seen, at = (v[begin:], after) if self.fresh else (v, begin + after)
+                yield (
+                    key,
+                    self.bank.rows(self.channels.filtered(seen), at),
+                    np.zeros((len(at), states.shape[1])),
+                    weights,
+                )
+                continue
             targets = states[at + 1] / recordings.size
             reference = v[at] @ self.channels.reference.T
             reference[:, self.channels.held] = y[at][:, self.channels.held]
@@ -194,14 +207,16 @@ class Design:
         return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
 
     @property
-    def errors(self) -> list[tuple[float, Design]]:
-        """Errors that measurements may have: their weights, and designs that see them."""
+    def errors(self) -> list[tuple[float, Design, Design]]:
+        """Errors that rows may have: their weights, designs that see them, and the same without."""
         bias, seen = self.recordings.bias, list[tuple[float, Shown]]()
         if not self.channels.inputs_only:
             seen.append((self.settings.gap_share, bridged))
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
             seen.append((1.0, lambda y: interpolated(y) + bias))
-        return [(share, replace(self, shown=shown)) for share, shown in seen]
+        errors = [(share, replace(self, shown=shown), self) for share, shown in seen]
+        late = replace(self, late=True)
+        return [*errors, (1.0, late, replace(late, fresh=False))]
 
     @property
     def fine(self) -> Design:
@@ -234,16 +249,16 @@ class Whitening:
     sample: tuple[Array, Array]  # thinned rows, from which they are found, with their weights
     directions: Array  # (p, r)
     penalty: Array  # (r,), 1 / sigma^2
-    trust: Array  # (r, r), moments of the rows that say how far entries may be wrong, apart from the start
-    start: Array  # (r, r), the same of values of the first sample that may be wrong by their size
+    trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
+    restart: Array  # (r, r), the same of starts in the middle of an episode
 
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Whitening]:
         """Find the directions of every design, in one pass over the recordings."""
         errors = [design.errors for design in designs]
-        every = iter(samples([*designs, *(wrong for several in errors for _, wrong in several)]))
+        every = iter(samples([*designs, *(one for several in errors for _, *pair in several for one in pair)]))
         right = [next(every) for _ in designs]
-        wrong = [[(share, next(every)[0]) for share, _ in several] for several in errors]
+        wrong = [[(share, next(every)[0] - next(every)[0]) for share, *_ in several] for several in errors]
         return [cls._found(*each) for each in zip(designs, right, wrong, strict=True)]
 
     @classmethod
@@ -253,14 +268,15 @@ class Whitening:
         bank, settings = design.bank, design.settings
         size = bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
-        trust, start = (np.diag(bank.trust(*of)) for of in ((settings.nonlinear_trust, 0.0), (0.0, 1.0)))
-        for share, wrong in errors:
-            trust = np.vstack([trust, qr_triangle((wrong - X) * scale * np.sqrt(share))])
-        least = min(settings.start_trust) * start
+        trust = np.diag(bank.trust(settings.nonlinear_trust, settings.start_trust))
+        for share, wrong in errors[:-1]:
+            trust = np.vstack([trust, qr_triangle(wrong * scale * np.sqrt(share))])
+        restart = qr_triangle(errors[-1][1] * scale)
+        least = min(settings.restart_shares) * restart
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, least])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
-        moments = (rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, start)))
+        moments = (rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, restart)))
         return cls(sample, directions, sigma[:count] ** -2.0, *moments)
 
 
@@ -305,7 +321,7 @@ class Moments:
         return np.maximum(found, 1e-30)
 
     def solved(self, weights: Array, candidates: Sequence[tuple[float, float]]) -> Iterator[Array]:
-        """Yield ridge coefficients (r, n) of groups with weights, for every penalty and relative error of the start."""
+        """Yield ridge coefficients (r, n) of groups with weights, for every penalty and weight of restarts."""
         from scipy.linalg import cho_factor, cho_solve
 
         weights = weights / weights.sum()
@@ -313,30 +329,31 @@ class Moments:
         gram = np.tensordot(weights, self.gram, 1) + whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 16 * len(gram) * EPS
-        for penalty, error in candidates:
-            A = gram + error**2 * whitening.start + np.diag(penalty * whitening.penalty)
+        for penalty, share in candidates:
+            A = gram + share * whitening.restart + np.diag(penalty * whitening.penalty)
             q = 1 / np.sqrt(np.diag(A))
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
-    def best(self, errors: Array, settings: EstimatorSettings) -> Whole:
+    def best(self, errors: Array, settings: EstimatorSettings) -> tuple[Whole, Whole]:
         """Return the best candidate of every state by logarithms of errors (groups, candidates, n) on what is left out.
 
-        Of relative errors of the start, a later one is taken if it gains enough over parts, by the margin: episodes
-        that start at other places have to confirm it.
+        Of weights of restarts, a later one is taken if it gains enough over parts, by the margin. Beside it stands the
+        best with the first one.
         """
-        starts, gain = errors.shape[1] // len(settings.penalties), -2 * np.log1p(-settings.start_gain)
+        starts, gain = errors.shape[1] // len(settings.penalties), -2 * np.log1p(-settings.restart_gain)
         # A state at zero throughout a group would ask for no estimate of it at all.
         counted = (self.power > 0)[:, None]
         counted |= ~counted.any(axis=0)
         mean = errors.mean(axis=0, where=counted)
         errors = np.where(counted, errors, mean)
-        best = mean[::starts].argmin(axis=0) * starts
+        first = mean[::starts].argmin(axis=0) * starts
+        best = first.copy()
         for i, state in np.ndindex(starts, len(best)):
             other = mean[i::starts, state].argmin() * starts + i
             one, before = (mean_by("part", self.groups, errors[:, c, state]) for c in (other, best[state]))
             best[state] = other if is_less(one + gain, before, settings.margin) else best[state]
-        return best
+        return best, first
 
     def known(self, group: Group) -> Flags:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
@@ -359,9 +376,10 @@ class Readout:
     design: Design
     sample: tuple[Array, Array]  # thinned rows of the bank, with their weights
     coefficients: Array  # (p, n)
+    begun: Array  # (p, n), with the largest weight of restarts, for the time after a start
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
-    penalties: Array  # (n, 2), and relative errors of the start
+    penalties: Array  # (n, 2), and weights of restarts
     others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
 
     @classmethod
@@ -374,17 +392,18 @@ class Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = moments.whitening
         weights, settings = condition_weights(moments), design.settings
-        candidates = [*product(settings.penalties, settings.start_trust if design.bank.starts else (0.0,))]
+        candidates = [*product(settings.penalties, settings.restart_shares)]
         others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         errors = np.array(left_out)
-        best = moments.best(np.log(errors), settings)
-        n = np.arange(errors.shape[2])
-        coefficients = np.array(list(moments.solved(weights, candidates)))[best, :, n].T
+        n, (best, first) = np.arange(errors.shape[2]), moments.best(np.log(errors), settings)
+        every = np.array(list(moments.solved(weights, candidates)))
+        coefficients, begun = (every[one, :, n].T for one in (best, first))
         return cls(
             design,
             whitening.sample,
             whitening.directions @ coefficients * design.recordings.size,
+            whitening.directions @ begun * design.recordings.size,
             errors[:, best, n],
             moments.errors(coefficients),
             np.array(candidates)[best],
@@ -405,7 +424,8 @@ class Readout:
 
     def without(self, group: Group) -> Readout:
         """Return the readout that does not know a group."""
-        return replace(self, coefficients=self.others[group] * self.design.recordings.size)
+        coefficients = self.others[group] * self.design.recordings.size
+        return replace(self, coefficients=coefficients, begun=coefficients)
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""

@@ -57,22 +57,28 @@ class EstimatorSettings(Settings):
     nonlinear_trust: float = Field(
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )
-    start_trust: tuple[float, ...] = Field(
-        (1.0, 0.1, 0.01),
-        min_length=1,
-        description="relative errors of the values of the first sample that are tried: rows with target zero",
+    start_trust: float = Field(
+        0.01, ge=0, description="relative error of the values of the first sample: rows with target zero"
     )
-    start_gain: float = Field(
-        0.05,
-        ge=0,
-        lt=1,
-        description="share by which the next one has to lessen errors, since machines start elsewhere too",
+    restart_shares: tuple[float, ...] = Field(
+        (0.1, 1e-3, 1e-5),
+        min_length=1,
+        description="weights that are tried of the errors that a start in the middle of an episode makes: rows with "
+        "target zero, since machines start elsewhere than in recordings",
+    )
+    restart_gain: float = Field(
+        0.02, ge=0, lt=1, description="share by which the next smaller one has to lessen errors"
     )
     gap_share: float = Field(
         1e-3,
         ge=0,
         description="weight of the errors that straight lines over lost measurements make, half of them: rows with "
-        "target zero, which bound the gains of filters on smooth recordings",
+        "target zero, which bound the gains of filters on smooth recordings; ten times as much where losses need it",
+    )
+    lost: float = Field(0.3, gt=0, lt=1, description="share of independent losses that errors have to stand, at most")
+    lost_growth: float = Field(2.0, gt=1, description="ratio by which these may increase errors on units left out")
+    negligible: float = Field(
+        0.01, gt=0, description="share of a state's largest value below which errors do not count"
     )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"

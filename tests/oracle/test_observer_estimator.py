@@ -361,8 +361,8 @@ def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_to
     recordings, _ = from_rest(list(rng.uniform(-2, 2, 6)), 1)
     unseen = from_rest(list(rng.uniform(-2, 2, 4)), 2)[1]
     errors = []
-    for shares in ((1e-12,), EstimatorSettings().restart_shares):
-        chosen = EstimatorSettings(**settings, restart_shares=shares)
+    for share in (1e-12, 0.1):
+        chosen = EstimatorSettings(**settings, restart_share=share, settled_share=1e-4 * share)
         observer = identify_estimator("e", lifting, (0,), ("u",), recordings, 0.01, settings=chosen).observer
         off = []
         for begin in (0, 150):
@@ -374,20 +374,6 @@ def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_to
     assert errors[1][0] < 0.05 * speed
 
 
-def test_lost_measurements_cost_less_where_their_bridges_are_rows_of_the_regression(exact):
-    _, batches = exact
-    recordings = Recordings.of(list(batches), batches.__getitem__)
-    batch, errors = next(iter(batches.values())), []
-    lost = np.random.default_rng(1).random(len(batch.states)) < 0.3
-    y = np.where(lost[:, None, None] & (np.arange(len(lost)) > 0)[:, None, None], np.nan, batch.states[..., :1])
-    for share in (0.0, FEW.gap_share):
-        settings = FEW.model_copy(update={"gap_share": share, "restart_shares": (1e-12,)})
-        observer = identify_estimator("plant", LIFTING, (0,), ("u",), recordings, DT, settings=settings).observer
-        off = run_observer(observer, y, batch.inputs)[:, 0, :3] - batch.states[:, 0]
-        errors.append(np.sqrt(np.mean(off**2, axis=0)) / np.abs(batch.states).max(axis=(0, 1)))
-    assert (errors[1][:2] < 0.4 * errors[0][:2]).all()  # the current follows from the input
-
-
 def test_errors_of_bridged_gaps_count_more_where_losses_need_it():
     recordings, _ = plant(units=3, spread=0.1)
     for least, share in ((1.0, FEW.gap_share), (1e-9, 1.0)):
@@ -396,19 +382,18 @@ def test_errors_of_bridged_gaps_count_more_where_losses_need_it():
         assert found.facts["gap_share"] == pytest.approx(share)
 
 
-def test_the_weight_of_restarts_ignores_groups_in_which_a_state_rests():
+def test_candidates_are_compared_without_groups_in_which_a_state_rests():
     recordings, _ = plant(units=3, episodes=3, spread=0.1)
-    settings = FEW.model_copy(update={"parts": 3, "penalties": (1e-8,), "restart_shares": (1.0, 0.1)})
-    made = design(recordings, settings=settings)
+    made = design(recordings, settings=FEW.model_copy(update={"parts": 3}))
     (moments,) = Moments.of([made], Whitening.of([made]))
     parts = moments.of_groups("part")
-    errors = np.zeros((len(parts), 2, 3))
-    errors[:, 1] = 0.1  # the smaller weight is no better
-    errors[parts < 2, 1, 0] = -60.0  # but where the first state is zero
+    errors = np.zeros((len(parts), 4, 3))
+    errors[:, 2:] = 0.1  # the other penalty is no better
+    errors[parts < 2, 2:, 0] = -60.0  # but where the first state is zero
     resting = replace(moments, power=np.where((parts < 2)[:, None] & (np.arange(3) == 0), 0.0, 1.0))
-    np.testing.assert_array_equal(resting.best(errors, settings)[0], [0, 0, 0])
-    errors[:, 1] = -0.3  # fourteen percent less, everywhere
-    np.testing.assert_array_equal(resting.best(errors, settings)[0], [1, 1, 1])
+    np.testing.assert_array_equal(resting.best(errors, 2), [[0, 0, 0], [1, 1, 1]])
+    errors[:, 2:] = -0.3
+    np.testing.assert_array_equal(resting.best(errors, 2), [[2, 2, 2], [3, 3, 3]])
 
 
 def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():

@@ -72,7 +72,7 @@ def test_hidden_states_start_where_they_do_in_training(population: Population) -
 
 
 def test_a_method_may_have_other_options(uncertain: UncertainModels) -> None:
-    first = WorstCaseH2(orders=(1,))
+    first = WorstCaseH2(max_order=1)
     design = kros.synthesize(uncertain, first, methods=())
     assert design.name == "linear_edmd/worst_case_h2"
     assert 0 < design.lower_bound <= design.facts["worst_case_h2"]  # type: ignore[operator]

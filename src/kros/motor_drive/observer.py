@@ -34,7 +34,7 @@ class LoadSettings:
     corner_hz: float | None = None  # what is faster in the known load, such as vibrations of the gear, is no load
     limit: float = np.inf  # of the current; episodes that reach it are left out
     delays: int = 20  # of the estimator, in samples: few recordings have a known load
-    start_trust: float = 1e-4  # of the estimator; the load of the first sample is in its tracking error
+    restart_share: float = 1e-9  # of the estimator, at all times; the load of the first sample is in its tracking error
 
 
 def load_observer(
@@ -67,8 +67,9 @@ def load_observer(
     recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
     lag = settings.level_s / batch.sample_period_s
     bank = {"dense": settings.delays, "longest": settings.delays}
-    lags = {"first_lag": lag, "last_lag": lag / recordings.length, "start_trust": settings.start_trust}
-    estimator = EstimatorSettings(**bank, **lags)
+    lags = {"first_lag": lag, "last_lag": lag / recordings.length}
+    restarts = dict.fromkeys(("restart_share", "settled_share"), settings.restart_share)
+    estimator = EstimatorSettings(**bank, **lags, **restarts)
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     result = identify_estimator(
         name, with_load, tuple(measured), inputs, recordings, batch.sample_period_s, None, estimator

@@ -4,8 +4,8 @@ For a channel v the bank holds
 
 .. math:: v_k, \quad m_i - m_{i+1}, \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
 
-with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. A resonance is a lag
-with a complex time constant, real and imaginary part. Before the first sample everything is taken to equal it. As a
+with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. A resonance is a
+lag with a complex time constant, real and imaginary part. Before the first sample everything is taken to equal it. As a
 system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`, :math:`\xi_{-1} = S v_0` (v ends with the constant
 channel 1), it is stable.
 """
@@ -82,12 +82,10 @@ class Bank:
         size[first] = np.outer(rms[first][moving :: self.channels], [*rms[:moving], 1.0]).ravel()
         return np.maximum(size, ITERATED * size.max())
 
-    def trust(self, nonlinear: float, start: float) -> Array:
+    def trust(self, nonlinear: float) -> Array:
         """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
         channel = self.channel
-        trust = np.where(channel < self.linear, 0.0, nonlinear)
-        trust[self._first] = start
-        return np.where(channel < self.channels - 1, trust, 0.0)
+        return np.where((channel >= self.linear) & (channel < self.channels - 1), nonlinear, 0.0)
 
     @property
     def _first(self) -> slice:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core import TINY, Array, Flags, Parameters, Whole
+from ...core import TINY, Array, Flags, Parameters
 from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
 from ..simulate import Course
@@ -19,8 +19,8 @@ _ROWS = 1000  # samples at a time
 
 
 def training(
-    recordings: Recordings, at: Sequence[int], settings: EstimatorSettings
-) -> tuple[Array, Array, Array, dict[str, Array]]:
+    observer: Observer, recordings: Recordings, settings: EstimatorSettings
+) -> tuple[Array, Array, Array, Parameters]:
     """Return states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
     length = min(min(recordings.lengths), settings.gap_samples // settings.gap_episodes)
     count = settings.gap_samples // length
@@ -28,16 +28,17 @@ def training(
     again = np.arange(count) % len(batches)  # every episode is seen with several losses
     signals = (
         [b.states for b in batches],
-        [b.measurements(at, arrived=False) for b in batches],
+        [b.measurements(observer.measured, arrived=False) for b in batches],
         [b.inputs for b in batches],
     )
     states, y, inputs = (np.concatenate(parts, axis=1)[:, again] for parts in signals)
     names = batches[0].parameters
-    return states, y, inputs, {k: np.concatenate([b.parameters[k] for b in batches])[again] for k in names}
+    own = observer.own({k: np.concatenate([b.parameters[k] for b in batches])[again] for k in names})
+    return states, y, inputs, own
 
 
 def decay(apart: Array, judged: Sequence[int]) -> Array:
-    """Return the stable matrix F (n, n) by which distances (n_samples, batch, n) from the fallback's input part decay.
+    """Return the stable matrix (n, n) by which distances (n_samples, batch, n) from estimates of inputs alone decay.
 
     Of a factor for every state and of roots of regressions over several lags, it is what predicts some states best over
     all of these lags.
@@ -84,8 +85,8 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
     to be better by the margin.
     """
     n, at = len(trial.recorded), list(trial.measured)
-    states, y, inputs, parameters = training(recordings, at, settings)
-    batch, own = states.shape[1], trial.own(parameters)
+    states, y, inputs, own = training(trial, recordings, settings)
+    batch = states.shape[1]
     hidden = [i for i in range(n) if i not in at]
     judged = hidden or at
     missing = losses(np.random.default_rng(settings.seed), *y.shape[:2])
@@ -111,7 +112,7 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
     least, best = np.full(batch, np.inf), bank
     for i, age in enumerate(tried):
         errors, known = every[:, i * batch : (i + 1) * batch], by_state[i * batch : (i + 1) * batch]
-        choice = earliest(errors, T[:, 0], settings.margin)
+        choice = errors.mean(axis=1).argmin(axis=0)
         score = np.vstack([errors[choice, :, range(len(judged))], known.T]).mean(axis=0)
         if age == tried[0] or is_less(score, least, settings.margin):
             half, recovery = np.full(n, age), np.zeros(n)
@@ -122,10 +123,10 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
 
 
 def decay_of(observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]) -> Array:
-    """Return by which matrix distances from the estimates of inputs alone decay; states `held` go on from their last."""
+    """Return by which matrix distances from estimates of inputs alone decay; states `held` go on from their last."""
     n, at = len(observer.recorded), list(observer.measured)
-    states, y, inputs, parameters = training(recordings, at, settings)
-    from_inputs = recorded_estimates(observer, y, inputs, observer.own(parameters))[..., n:]
+    states, y, inputs, own = training(observer, recordings, settings)
+    from_inputs = recorded_estimates(observer, y, inputs, own)[..., n:]
     F = decay(states - from_inputs, [i for i in range(n) if i not in at] or at)
     F[held], F[:, held] = 0.0, 0.0
     return F
@@ -134,12 +135,12 @@ def decay_of(observer: Observer, recordings: Recordings, settings: EstimatorSett
 def loss_growth(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> float:
     """Return by which ratio errors that count grow at most where measurements are lost independently, up to a share."""
     n, at = len(observer.recorded), list(observer.measured)
-    states, y, inputs, parameters = training(recordings, at, settings)
+    states, y, inputs, own = training(observer, recordings, settings)
     shares = settings.lost * np.arange(1, 1 + y.shape[1]) / y.shape[1]
     lost = np.random.default_rng(settings.seed).random(y.shape[:2]) < shares
     lost[0] = False
-    signals = y, np.where(lost[..., None], np.nan, y)
-    off = [recorded_estimates(observer, one, inputs, observer.own(parameters))[..., :n] - states for one in signals]
+    shown = y, np.where(lost[..., None], np.nan, y)
+    off = [recorded_estimates(observer, one, inputs, own)[..., :n] - states for one in shown]
     some = [i for i in range(n) if i not in at] or at
     right, wrong = (np.mean((one[..., some] / recordings.size[some]) ** 2, axis=(0, 1)) for one in off)
     return float(np.sqrt((wrong / np.maximum(right, settings.negligible**2)).max()))
@@ -151,16 +152,6 @@ def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Param
     some = [*range(n), *range(-2 * n, -n)]
     starts = range(0, len(y), _ROWS)
     return np.concatenate([course.take(y[k : k + _ROWS], u[k : k + _ROWS]).estimates[..., some] for k in starts])
-
-
-def earliest(errors: Array, half: Array, margin: float) -> Whole:
-    """Return for every state of errors (c, batch, n) the best of least half within paired standard errors."""
-    mean = errors.mean(axis=1)
-    apart = errors - np.take_along_axis(errors, np.argmin(mean, axis=0)[None, None], axis=0)
-    error = apart.std(axis=1, ddof=1) / np.sqrt(errors.shape[1]) if errors.shape[1] > 1 else 0.0
-    alike = apart.mean(axis=1) <= margin * error
-    least = np.where(alike, half[:, None], np.inf).min(axis=0)
-    return np.argmin(np.where(alike & (half[:, None] == least), mean, np.inf), axis=0)
 
 
 def blended_errors(

@@ -268,11 +268,11 @@ class Whitening:
         bank, settings = design.bank, design.settings
         size = bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
-        trust = np.diag(bank.trust(settings.nonlinear_trust, settings.start_trust))
+        trust = np.diag(bank.trust(settings.nonlinear_trust))
         for share, wrong in errors[:-1]:
             trust = np.vstack([trust, qr_triangle(wrong * scale * np.sqrt(share))])
         restart = qr_triangle(errors[-1][1] * scale)
-        least = min(settings.restart_shares) * restart
+        least = np.sqrt(settings.settled_share) * restart
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, least])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
@@ -335,25 +335,15 @@ class Moments:
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
-    def best(self, errors: Array, settings: EstimatorSettings) -> tuple[Whole, Whole]:
-        """Return the best candidate of every state by logarithms of errors (groups, candidates, n) on what is left out.
+    def best(self, errors: Array, weights: int) -> list[Whole]:
+        """Return the best candidates of every state for each of several weights of restarts, in turn the last index.
 
-        Of weights of restarts, a later one is taken if it gains enough over parts, by the margin. Beside it stands the
-        best with the first one.
+        They are best by logarithms of errors (groups, candidates, n) on what is left out.
         """
-        starts, gain = errors.shape[1] // len(settings.penalties), -2 * np.log1p(-settings.restart_gain)
         # A state at zero throughout a group would ask for no estimate of it at all.
         counted = (self.power > 0)[:, None]
-        counted |= ~counted.any(axis=0)
-        mean = errors.mean(axis=0, where=counted)
-        errors = np.where(counted, errors, mean)
-        first = mean[::starts].argmin(axis=0) * starts
-        best = first.copy()
-        for i, state in np.ndindex(starts, len(best)):
-            other = mean[i::starts, state].argmin() * starts + i
-            one, before = (mean_by("part", self.groups, errors[:, c, state]) for c in (other, best[state]))
-            best[state] = other if is_less(one + gain, before, settings.margin) else best[state]
-        return best, first
+        mean = errors.mean(axis=0, where=counted | ~counted.any(axis=0))
+        return [mean[i::weights].argmin(axis=0) * weights + i for i in range(weights)]
 
     def known(self, group: Group) -> Flags:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
@@ -376,7 +366,7 @@ class Readout:
     design: Design
     sample: tuple[Array, Array]  # thinned rows of the bank, with their weights
     coefficients: Array  # (p, n)
-    begun: Array  # (p, n), with the largest weight of restarts, for the time after a start
+    begun: Array  # (p, n), with the weight of restarts for the time after a start
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
     penalties: Array  # (n, 2), and weights of restarts
@@ -392,11 +382,11 @@ class Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = moments.whitening
         weights, settings = condition_weights(moments), design.settings
-        candidates = [*product(settings.penalties, settings.restart_shares)]
+        candidates = [*product(settings.penalties, (settings.settled_share, settings.restart_share))]
         others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         errors = np.array(left_out)
-        n, (best, first) = np.arange(errors.shape[2]), moments.best(np.log(errors), settings)
+        n, (best, first) = np.arange(errors.shape[2]), moments.best(np.log(errors), 2)
         every = np.array(list(moments.solved(weights, candidates)))
         coefficients, begun = (every[one, :, n].T for one in (best, first))
         return cls(
@@ -429,7 +419,8 @@ class Readout:
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
-        return mean_by("fold", list(self.others), np.log(self.left_out[:, list(states)]).mean(axis=1))
+        folds, errors = np.array([g.fold for g in self.others]), np.log(self.left_out[:, list(states)]).mean(axis=1)
+        return np.array([errors[folds == fold].mean() for fold in np.unique(folds)])
 
     def episode_errors(self) -> Array:
         """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
@@ -442,12 +433,6 @@ class Readout:
 def spread(items: Sequence[T], count: int) -> list[T]:
     """Return so many items, evenly spaced from the first to the last."""
     return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
-
-
-def mean_by(what: str, groups: Sequence[Group], values: Array) -> Array:
-    """Return means of values of groups over every fold, or part, shape (folds,)."""
-    names = np.array([getattr(group, what) for group in groups])
-    return np.array([values[names == name].mean() for name in np.unique(names)])
 
 
 def is_less(one: Array, other: Array, margin: float) -> bool:

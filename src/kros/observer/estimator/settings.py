@@ -57,18 +57,13 @@ class EstimatorSettings(Settings):
     nonlinear_trust: float = Field(
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )
-    start_trust: float = Field(
-        0.01, ge=0, description="relative error of the values of the first sample: rows with target zero"
+    restart_share: float = Field(
+        0.1,
+        gt=0,
+        description="weight of the errors that a start in the middle of an episode makes, for the time after a start: "
+        "rows with target zero, since machines start elsewhere than in recordings",
     )
-    restart_shares: tuple[float, ...] = Field(
-        (0.1, 1e-3, 1e-5),
-        min_length=1,
-        description="weights that are tried of the errors that a start in the middle of an episode makes: rows with "
-        "target zero, since machines start elsewhere than in recordings",
-    )
-    restart_gain: float = Field(
-        0.02, ge=0, lt=1, description="share by which the next smaller one has to lessen errors"
-    )
+    settled_share: float = Field(1e-5, gt=0, description="weight of these errors for all other time")
     gap_share: float = Field(
         1e-3,
         ge=0,

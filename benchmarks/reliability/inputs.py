@@ -30,7 +30,6 @@ from kros.core.lti import StateSpace
 from kros.data import Channel, Role, from_arrays, from_frame, read, write_parquet
 from kros.data.recording import check_population, usable_episodes
 from kros.identify import ModelSet
-from kros.interop import from_pykoop
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
 from kros.report.manifest import Artefact, read_manifest, write_manifest
@@ -391,7 +390,6 @@ def memory_targets() -> list[Target]:
         for row in rows
     ]
     named = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
-    pykoop = {u: [[float(i), *row] for i, rows in enumerate(e) for row in rows] for u, e in table.items()}
 
     def damaged_frame(rng: random.Random) -> Any:
         frame = pd.DataFrame(rows).astype(object)
@@ -418,11 +416,8 @@ def memory_targets() -> list[Target]:
     def arrays(data: Any) -> Any:
         return recorded(from_arrays(data.get("data"), named, data.get("period")))
 
-    def koop(data: Any) -> Any:
-        return recorded(from_pykoop(data.get("data"), data.get("inputs"), data.get("period")))
-
     frame_good = recorded(from_frame(pd.DataFrame(rows), named, sample_period_s=0.01))
-    good, other = {"data": table, "period": 0.01}, {"data": pykoop, "period": 0.01, "inputs": 1}
+    good = {"data": table, "period": 0.01}
     return [
         Target("reader arrays", lambda r: mutate_tree(good, r), arrays, arrays(good), False),
         Target(
@@ -432,7 +427,6 @@ def memory_targets() -> list[Target]:
             frame_good,
             False,
         ),
-        Target("reader pykoop", lambda r: mutate_tree(other, r), koop, koop(other), False),
     ]
 
 

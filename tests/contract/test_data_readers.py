@@ -1,7 +1,6 @@
-"""Every reader gives the same population: raw layout, Parquet, CSV, arrays, a long frame, pykoop's array."""
+"""Every reader gives the same population: raw layout, Parquet, CSV, arrays, a long frame."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from kros.data import (
     write_parquet,
 )
 from kros.data.readers.motor_drive_raw import write_raw
-from kros.interop import from_pykoop, to_pykoop
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 PERIOD = 1e-3
@@ -100,24 +98,12 @@ def by_frame(folder: Path) -> Population:
     return prepare(from_frame(pd.concat(parts), CHANNELS, sample_period_s=PERIOD), PREPARATION)
 
 
-def by_pykoop(folder: Path) -> Population:
-    """pykoop knows no conditions, so each goes its own way."""
-    source = from_arrays(ALIGNED, CHANNELS, PERIOD)
-    episodes = {}
-    for condition in source.conditions:
-        X = {unit: to_pykoop(source.select([unit], [condition])) for unit in source.unit_ids}
-        part = from_pykoop(X, 2, PERIOD, channels=CHANNELS)
-        episodes.update({replace(key, condition=condition): part.read(key) for key in part.episodes})
-    return prepare(from_arrays(episodes, CHANNELS, PERIOD), PREPARATION)
-
-
 READERS = {
     "raw": by_raw,
     "parquet": by_parquet,
     "csv": by_csv,
     "arrays": by_arrays,
     "frame": by_frame,
-    "pykoop": by_pykoop,
 }
 
 

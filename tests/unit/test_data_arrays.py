@@ -1,4 +1,4 @@
-"""Arrays, long frames and pykoop's array."""
+"""Arrays and long frames."""
 
 from typing import Any
 
@@ -8,7 +8,6 @@ import pytest
 import kros
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame
-from kros.interop import from_pykoop, to_pykoop
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 
@@ -128,40 +127,3 @@ def test_frame_refuses() -> None:
         from_frame(values(0), CHANNELS, time="t")
     with pytest.raises(DataError, match="population is empty"):
         from_frame(pd.DataFrame(columns=["unit", "x", "v", "u"]), CHANNELS, sample_period_s=0.1)
-
-
-def koopman_array() -> np.ndarray:
-    return np.concatenate([np.column_stack([np.full(12, e), values(e)]) for e in (0, 3, 7)])
-
-
-def test_pykoop_both_ways() -> None:
-    X = koopman_array()
-    population = from_pykoop({"a": X, "b": X}, 1, 0.1)
-    assert (population.states, population.inputs, population.measured) == (("x0", "x1"), ("u0",), ("x0", "x1"))
-    assert [k.episode for k in population.keys("a")] == ["0", "3", "7"]
-    np.testing.assert_array_equal(population.read(EpisodeKey("b", "default", "7")), values(7))
-    back = to_pykoop(population.select(["a"]))
-    np.testing.assert_array_equal(back[:, 1:], X[:, 1:])
-    np.testing.assert_array_equal(back[:, 0], np.repeat([0, 1, 2], 12))
-    assert to_pykoop(population).shape == (72, 4)
-
-
-def test_pykoop_refuses() -> None:
-    half = koopman_array()
-    half[4, 0] = 0.5
-    with pytest.raises(DataError, match=r"should number the episodes .* found 0\.5 in row 4 of unit 0"):
-        from_pykoop(half, 1, 0.1)
-    for X, n_inputs in [(koopman_array(), 3), (koopman_array()[:, 0], 1), (koopman_array(), -1), (koopman_array(), {})]:
-        with pytest.raises(DataError, match="check n_inputs"):
-            from_pykoop(X, n_inputs, 0.1)
-    with pytest.raises(DataError, match="check n_inputs"):
-        from_pykoop({"a": koopman_array(), "b": koopman_array()[:, :3]}, 1, 0.1)
-    with pytest.raises(DataError, match="of one width"):
-        from_pykoop({}, 1, 0.1)
-
-
-def test_pykoop_rows_of_an_episode_may_be_scattered() -> None:
-    X = koopman_array()
-    shuffled = X[np.argsort(np.tile(np.arange(12), 3), kind="stable")]  # sample by sample instead of episode by episode
-    population = from_pykoop(shuffled, 1, 0.1)
-    np.testing.assert_array_equal(population.read(EpisodeKey("0", "default", "3")), values(3))

@@ -19,7 +19,6 @@ from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, prepare, read, steps, write_parquet
 from kros.data.readers.parquet import read_parquet
 from kros.identify.survey import period_alerts
-from kros.interop import from_pykoop
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 MAPPING: dict[str, Any] = {
@@ -130,8 +129,6 @@ def test_names_that_no_table_can_show(tmp_path: Path) -> None:
 def test_periods_that_are_none(period: Any) -> None:
     with pytest.raises(DataError, match="sampling period should be a number of seconds above zero"):
         from_arrays({"a": [samples(0)]}, CHANNELS, period)
-    with pytest.raises(DataError):
-        from_pykoop(np.column_stack([np.zeros(80), samples(0)]), 1, period)
 
 
 def test_resampling_to_more_samples_than_anybody_wants() -> None:

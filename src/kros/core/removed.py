@@ -82,8 +82,8 @@ Results are no longer drawn by a function; use their method plot, such as models
     kros.report: plot
 Models of units are no longer converted by a function of their own; use to_control(models.systems([unit])[0]).
     kros.interop: models_to_control
-The array format of pykoop is no longer in kros.data; use from_pykoop and to_pykoop of kros.interop.
-    kros.data: from_pykoop to_pykoop
+The array format of pykoop is no longer read and written; use kros.from_arrays with an array for every episode.
+    kros.data: from_pykoop to_pykoop kros.interop: from_pykoop to_pykoop
 Random Fourier features are no longer a family of liftings; use radial, with centres by k-means.
     kros.lifting: fourier_features
 Resampled models are no longer public; kros.quantify and the report use them by themselves.

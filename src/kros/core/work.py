@@ -69,7 +69,8 @@ def _read(path: Path | None, kind: Any, usable: Callable[[Any], bool]) -> Any:
     if path is None or not path.exists():
         return None
     try:
-        result = unpacked(read_bytes(path, MAX_ARRAYS_BYTES), path, kind)
+        arrays = unpack_arrays(read_bytes(path, MAX_ARRAYS_BYTES), path)
+        result = united(kind, json.loads(arrays["content"].tobytes()), arrays)
     except (DataError, ValueError, LookupError, TypeError, AttributeError) as error:
         log.warning("%s: a result cannot be read (%s), and is computed again", path, error)
         return None
@@ -87,20 +88,9 @@ class Storing:
         path, content = task
         result = self.function(content)
         if path is not None:
-            write_bytes(path, packed(result))
+            text, arrays = divided(result)
+            write_bytes(path, pack_arrays({"content": np.frombuffer(json_bytes(text), np.uint8), **arrays}))
         return result
-
-
-def packed(value: Any) -> bytes:
-    """Return a result as an archive of its arrays, beside JSON of all else."""
-    content, arrays = divided(value)
-    return pack_arrays({"content": np.frombuffer(json_bytes(content), np.uint8), **arrays})
-
-
-def unpacked(content: bytes, path: Path, kind: Any) -> Any:
-    """Return what `packed` packed."""
-    arrays = unpack_arrays(content, path)
-    return united(kind, json.loads(arrays["content"].tobytes()), arrays)
 
 
 @frozen

@@ -1,4 +1,4 @@
-"""Bridges to scikit-learn, python-control and pykoop. Each is imported when one of its names is first used.
+"""Bridges to scikit-learn and python-control. Each is imported when one of its names is first used.
 
 Examples
 --------
@@ -17,11 +17,9 @@ from ..core.removed import lazy_names
 
 if TYPE_CHECKING:
     from .control import from_control, to_control
-    from .pykoop import from_pykoop, to_pykoop
     from .sklearn_estimator import KoopmanRegressor
 
-__all__ = ["KoopmanRegressor", "from_control", "from_pykoop", "to_control", "to_pykoop"]
+__all__ = ["KoopmanRegressor", "from_control", "to_control"]
 
 _HOME = dict.fromkeys(__all__, "control") | {"KoopmanRegressor": "sklearn_estimator"}
-_HOME |= dict.fromkeys(("from_pykoop", "to_pykoop"), "pykoop")
 __getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)

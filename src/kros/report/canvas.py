@@ -10,7 +10,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ..core import AnyArray, ArrayLike, Record
-from .names import RAISED, minus
+from .names import RAISED
 from .theme import DRAWING
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ else:  # for annotations alone: matplotlib is imported when something is drawn
     Artist = Axes = Figure = Any
 
 Captioned = tuple[Figure, str]  # a figure and more of its caption
-_PREFIXES = "pnµm kMG"  # powers of a thousand, from 10⁻¹²
 
 
 def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, AnyArray]:
@@ -32,25 +31,7 @@ def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, AnyArray]:
 
     layout = ConstrainedLayoutEngine(wspace=0, hspace=0)
     figure = Figure(figsize=(DRAWING.width_in, DRAWING.row_in + (rows - 1) * DRAWING.more_rows_in), layout=layout)
-    panels = figure.subplots(rows, columns, squeeze=False, **options)
-    for panel in panels.ravel():
-        engineering(panel.yaxis)
-    return figure, panels
-
-
-def engineering(axis: Axis) -> None:
-    """Number a linear axis with SI prefixes below 0.001 and from 1000 on, without a factor in the corner."""
-    from matplotlib.ticker import FuncFormatter
-
-    def text(value: float, _: Any) -> str:
-        largest = max(map(abs, axis.get_view_interval()))
-        exponent = 3 * floor(log10(largest) / 3) if largest > 0 else 0
-        place = exponent // 3 + 4
-        if place in (3, 4) or not 0 <= place < len(_PREFIXES) or value == 0:
-            return minus(f"{value:.6g}")
-        return minus(f"{value / 10.0**exponent:.4g} {_PREFIXES[place]}")
-
-    axis.set_major_formatter(FuncFormatter(text))
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
 def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Recordings that are in memory already: arrays, a long pandas DataFrame, pykoop's single array."""
+"""Recordings that are in memory already: arrays, or a long pandas DataFrame."""
 
 from __future__ import annotations
 

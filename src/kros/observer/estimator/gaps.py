@@ -11,7 +11,7 @@ from ...core import TINY, Array, Flags, Parameters
 from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
 from ..simulate import Course
-from .regression import Recordings, is_less
+from .regression import Recordings
 from .settings import EstimatorSettings
 
 _NEVER = 1e12  # samples: an age that no gap has
@@ -81,8 +81,7 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
     """Return a filter bank with the ages of gaps that minimise a trial's errors under simulated losses.
 
     The trial does not know the recordings. Ages of measured states change what the filters see: some are tried side by
-    side, with the best of the others for each. A larger one, with which the filters go on by themselves for longer, has
-    to be better by the margin.
+    side, with the best of the others for each.
     """
     n, at = len(trial.recorded), list(trial.measured)
     states, y, inputs, own = training(trial, recordings, settings)
@@ -105,21 +104,20 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(halves, recoveries))
     truth, lost = np.tile(states, (1, len(tried), 1)), np.tile(missing, (1, len(tried)))
     others = [i for i in at if i not in judged]
-    substituted = np.where(lost[..., None], filtered[..., others] - truth[..., others], 0.0)
+    by_state = np.log(np.mean((filtered - truth)[..., others] ** 2 * lost[..., None], axis=0) + TINY)
     filtered[..., others] = truth[..., others]
     every = blended_errors(truth, filtered, from_inputs, lost, F, judged, T, mu)
-    by_state = np.log(np.mean(substituted**2, axis=0) + TINY)
-    least, best = np.full(batch, np.inf), bank
-    for i, age in enumerate(tried):
-        errors, known = every[:, i * batch : (i + 1) * batch], by_state[i * batch : (i + 1) * batch]
+    found = list[tuple[float, FilterBank]]()
+    for age, errors, known in zip(
+        tried, *(np.split(part, len(tried), axis=-2) for part in (every, by_state)), strict=True
+    ):
         choice = errors.mean(axis=1).argmin(axis=0)
-        score = np.vstack([errors[choice, :, range(len(judged))], known.T]).mean(axis=0)
-        if age == tried[0] or is_less(score, least, settings.margin):
-            half, recovery = np.full(n, age), np.zeros(n)
-            if hidden:
-                half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
-            least, best = score, replace(bank, half=half, recovery=recovery)
-    return best
+        half, recovery = np.full(n, age), np.zeros(n)
+        if hidden:
+            half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
+        score = np.mean([*errors[choice, :, range(len(judged))], *known.T])
+        found.append((float(score), replace(bank, half=half, recovery=recovery)))
+    return min(found, key=lambda one: one[0])[1]
 
 
 def decay_of(observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]) -> Array:

@@ -169,22 +169,15 @@ class Design:
         measured, rng = list(self.channels.measured), np.random.default_rng(self.settings.seed)
         for key, (at, weights) in zip(recordings.keys, samples, strict=True):
             states, y, v = self.episode(recordings.read(key))
-            if self.late:
-                begin = int(rng.integers(0, len(v) // 2))
-                after = np.minimum(at, len(v) - begin - 1)
-                seen, at = (v[begin:], after) if self.fresh else (v, begin + after)
-                yield (
-                    key,
-                    self.bank.rows(self.channels.filtered(seen), at),
-                    np.zeros((len(at), states.shape[1])),
-                    weights,
-                )
-                continue
+            begin = int(rng.integers(0, len(v) // 2)) if self.late else 0
+            after = np.minimum(at, len(v) - begin - 2)
+            at = begin + after
+            seen = self.bank.rows(self.channels.filtered(v[begin:] if self.fresh else v), after if self.fresh else at)
             targets = states[at + 1] / recordings.size
             reference = v[at] @ self.channels.reference.T
             reference[:, self.channels.held] = y[at][:, self.channels.held]
             targets[:, measured] -= reference / recordings.size[measured]
-            yield key, self.bank.rows(self.channels.filtered(v), at), targets, weights
+            yield key, seen, targets, weights
 
     def episode(self, batch: EpisodeBatch) -> tuple[Array, Array, Array]:
         """Return states, measurements as they are shown, and channels of an episode, (n_samples, .)."""

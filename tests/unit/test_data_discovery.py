@@ -208,3 +208,12 @@ def test_a_wild_sample_is_reported(tmp_path: Path):
     found = discover(tmp_path)
     assert len(found.population.episodes) == 8
     assert any(re.search(r"hot_run2\.csv: channel 'speed' is .* at sample 30,", text) for text in found.findings)
+
+
+def test_the_rate_is_found_from_times_that_are_rounded(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    for unit, run in ((u, r) for u in "ab" for r in (1, 2, 3)):
+        values = np.column_stack([np.arange(90) / 60, rng.normal(size=(90, 3))])
+        (tmp_path / unit).mkdir(exist_ok=True)
+        np.savetxt(tmp_path / unit / f"{run}.csv", values, "%.2f", ",", header="time,angle,speed,voltage", comments="")
+    assert any("resampled to a period of 0.0166 s" in text for text in discover(tmp_path).findings)  # not 0.02 s

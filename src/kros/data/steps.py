@@ -284,7 +284,7 @@ class Resample(Step):
 
     def on_grid(self, time_s: Array, values: Array, median_s: float) -> Array:
         """Return samples at increasing times on an even grid from the first time on, shape (n_new, n_channels)."""
-        finer = math.ceil(self.period_s / median_s - 1e-3)
+        finer = max(1, math.ceil(self.period_s / median_s - 1e-3))
         step = self.period_s / finer
         grid = time_s[0] + step * np.arange(math.floor((time_s[-1] - time_s[0]) / step + CHECK.end) + 1)
         fine = np.column_stack([np.interp(grid, time_s, column) for column in values.T])

@@ -252,8 +252,8 @@ def require_useful(problem: ObserverProblem, observer: Observer, bound: float) -
     without = certify_errors(problem, problem.estimate_error(nothing))[0]
     if bound >= without:
         raise SynthesisError(
-            f"the bound over the set is {bound:.3g}, without an estimate {without:.3g}: machines relate their states more "
-            "closely than their models do."
+            f"the bound over the set is {bound:.3g}, without an estimate {without:.3g}: machines relate states more "
+            "closely than models do."
         )
 
 

@@ -105,7 +105,7 @@ def identify_estimator(
     observer, trial = let_go(observer, F), let_go(trial, F)
     assert observer.bank is not None
     assert trial.bank is not None
-    bank = with_gaps(observer.bank, trial, unseen, settings)
+    bank = with_gaps(observer.bank, trial, F, unseen, settings)
     trial = replace(trial, bank=replace(bank, start=trial.bank.start))
     if 0 < settings.gap_share < 1 and loss_growth(trial, unseen, settings) > settings.lost_growth:
         heavier = settings.model_copy(update={"gap_share": 10 * settings.gap_share})

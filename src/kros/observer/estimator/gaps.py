@@ -77,7 +77,9 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
     return missing
 
 
-def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
+def with_gaps(
+    bank: FilterBank, trial: Observer, F: Array, recordings: Recordings, settings: EstimatorSettings
+) -> FilterBank:
     """Return a filter bank with the ages of gaps that minimise a trial's errors under simulated losses.
 
     The trial does not know the recordings. Ages of measured states change what the filters see: some are tried side by
@@ -89,8 +91,6 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
     hidden = [i for i in range(n) if i not in at]
     judged = hidden or at
     missing = losses(np.random.default_rng(settings.seed), *y.shape[:2])
-    last = slice(trial.lifting.n_states - n, trial.lifting.n_states)
-    F = trial.A[last, last]
     longest = settings.blocks(recordings.length)[-1]
     halves, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     tried = halves[::2]

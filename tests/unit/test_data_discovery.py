@@ -213,7 +213,7 @@ def test_a_wild_sample_is_reported(tmp_path: Path):
 def test_the_rate_is_found_from_times_that_are_rounded(tmp_path: Path):
     rng = np.random.default_rng(0)
     for unit, run in ((u, r) for u in "ab" for r in (1, 2, 3)):
-        values = np.column_stack([np.arange(90) / 60, rng.normal(size=(90, 3))])
+        values = np.column_stack([np.arange(240) / 60, rng.normal(size=(240, 3))])
         (tmp_path / unit).mkdir(exist_ok=True)
         np.savetxt(tmp_path / unit / f"{run}.csv", values, "%.2f", ",", header="time,angle,speed,voltage", comments="")
-    assert any("resampled to a period of 0.0166 s" in text for text in discover(tmp_path).findings)  # not 0.02 s
+    assert any("resampled to a period of 0.0167 s" in text for text in discover(tmp_path).findings)  # not 0.02 s

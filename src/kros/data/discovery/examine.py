@@ -35,7 +35,7 @@ class EpisodeLook:
     key: EpisodeKey
     wrong: str = ""  # why it cannot be used, or nothing
     n_samples: int = 0  # that can be used
-    period_s: float = np.nan  # mean step of time without gaps
+    period_s: float = np.nan  # typical step of time
     uneven: tuple[float, int] = (0.0, 0)  # largest relative deviation of a step of time, and the sample before it
     nan: str = ""  # where it holds NaN or infinity, or nothing
     digest: str = ""
@@ -60,8 +60,8 @@ def _look(population: Population) -> list[EpisodeLook]:
             check_increasing(recording)
             period, deviation = population.sample_period_s, np.zeros(1)
             if time is not None and len(time) > 1:
-                steps = np.diff(time)  # rounded time has steps of two sizes
-                period = float(steps[steps < 1.5 * np.median(steps)].mean())
+                far = min(100, len(time) // 2)  # steps at once: single ones may be rounded
+                period = float(np.median(time[far:] - time[:-far])) / far
                 deviation = np.abs(np.diff(time) / period - 1)
             look = EpisodeLook(key, "", len(values), period, (float(deviation.max()), int(deviation.argmax())))
             check_episode(values, key, population.columns)

@@ -247,12 +247,15 @@ class Whitening:
 
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Whitening]:
-        """Find the directions of every design, in one pass over the recordings."""
-        errors = [design.errors for design in designs]
-        every = iter(samples([*designs, *(one for several in errors for _, *pair in several for one in pair)]))
-        right = [next(every) for _ in designs]
-        wrong = [[(share, next(every)[0] - next(every)[0]) for share, *_ in several] for several in errors]
-        return [cls._found(*each) for each in zip(designs, right, wrong, strict=True)]
+        """Find the directions of every design, one design after the other: memory."""
+        found = []
+        for design in designs:
+            errors = design.errors
+            sample, *others = samples([design, *(one for _, *pair in errors for one in pair)])
+            pairs = iter(others)
+            wrong = [(share, next(pairs)[0] - next(pairs)[0]) for share, *_ in errors]
+            found.append(cls._found(design, sample, wrong))
+        return found
 
     @classmethod
     def _found(cls, design: Design, sample: tuple[Array, Array], errors: Sequence[tuple[float, Array]]) -> Whitening:

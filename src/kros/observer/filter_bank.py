@@ -2,20 +2,18 @@ r"""What makes an observer a filter bank: how it starts, and what replaces missi
 
 While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its
 internal states are the filters z of measurements and inputs, whose estimate is given then, a second estimate
-:math:`x^s` from these for the time after a start, the filters w of inputs
-alone, their own estimate :math:`x^u` of all recorded states, and the distance o from it, which decays as machines do by
-themselves. Before a step
+:math:`x^s` from these for the time after a start, the filters w of inputs alone, their own estimate :math:`x^u` of all
+recorded states, and the distance o from it, which decays as machines do by themselves. Before a step
 
 .. math:: o_k \leftarrow o_k + (1 - m) (x_k - x^u_k - o_k), \qquad o_{k+1} = F o_k,
 
 where m is zero for measurements that arrive and one for all that is not measured while some are missing: estimates
 that follow from substitutes do not enter what substitutes follow from. So the fallback :math:`x^u + o` continues the
 last estimate and tends to :math:`x^u`; estimates in which the fallback counts already change it less, since they say
-little. The age a of a gap is
-the number of samples that are missing so far; when measurements return it falls by a factor :math:`\mu` a sample, as
-the filters forget what stood for them. Every state has its own :math:`\mu`: a state that is estimated from slow
-filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m is below one percent after five time
-constants of :math:`\mu`. The estimate of a state that is not measured is
+little. The age a of a gap is the number of samples that are missing so far; when measurements return it falls by a
+factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own :math:`\mu`: a state
+that is estimated from slow filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m is below
+one percent after five time constants of :math:`\mu`. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
@@ -24,9 +22,8 @@ falls from :math:`0.1 e^5 T` on as the slowest filter forgets, and T = 1.
 
 A missing measurement is replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback, and o of
 states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so
-are they. When a measurement returns, the gap is bridged
-by a straight line: the response r of the filters to a unit ramp was run along, and ``z`` is corrected by
-:math:`r (y - \hat y) / (g + 1)` after g samples.
+are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit
+ramp was run along, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g samples.
 """
 
 from __future__ import annotations
@@ -73,7 +70,9 @@ class Gaps:
         n, q = len(A), len(measured)
         self.bank, self.measured, self.recorded = bank, list(measured), recorded
         self.filters = slice(recorded, recorded + bank.filters)
-        self.begun, self.from_inputs, self.offset = (slice(n - k * recorded, n - (k - 1) * recorded) for k in (3, 2, 1))
+        self.after_start, self.from_inputs, self.offset = (
+            slice(n - k * recorded, n - (k - 1) * recorded) for k in (3, 2, 1)
+        )
         self._A, self._B = A[self.filters, self.filters], A[self.filters, :][:, self.measured]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
         self._most = np.where(self.hidden, bank.reach, np.inf)
@@ -116,7 +115,7 @@ class Gaps:
         recovered = np.where(some[:, None], self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
         age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
-        recorded += self.start**2 / (1 + self.start**2) * (following[:, self.begun] - recorded)
+        recorded += self.start**2 / (1 + self.start**2) * (following[:, self.after_start] - recorded)
         recorded += self.hidden * bank.level(age) * (fallback - recorded)
         if some.any() or self.count.any():
             ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)

@@ -20,7 +20,8 @@ from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.gaps import decay
 from kros.observer.estimator.reduction import Filters, reduced
-from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated, samples
+from kros.observer.estimator.regression import Moments, Readout, Whitening
+from kros.observer.estimator.rows import Design, interpolated
 
 
 def design(recordings, family="linear", settings=FEW):
@@ -71,7 +72,7 @@ def test_a_lifting_that_makes_models_affine_has_the_same_channels():
 def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     recordings, _ = plant(units=3, spread=0.1)
     made = design(recordings)
-    (whitening,) = Whitening.of([made])
+    whitening = Whitening.of(made)
     (moments,) = Moments.of([made], [whitening])
     penalty, share = 1e-6, 0.1
     (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, share)])
@@ -106,7 +107,7 @@ def test_reduced_filters_are_stable_at_every_order_and_tend_to_the_bank():
     wanted = readout.design.bank.rows(v, np.arange(len(v))) @ readout.coefficients
     apart = []
     for order in (1, 3, 6, 12):
-        filters = reduced(readout, samples([readout.design.fine])[0], order)
+        filters = reduced(readout, readout.design.fine.sample(), order)
         assert np.abs(np.linalg.eigvals(filters.A)).max() < 1
         z, estimates = filters.S @ v[0], []
         for row in v:
@@ -142,7 +143,7 @@ def test_a_reduction_keeps_its_digits_where_coefficients_cancel():
     lag = len(channels) - 1 + bank.delayed * (len(bank.taps) - 2)
     large = readout.coefficients.copy()
     large[lag : lag + 2] += 1e10 * np.outer([2.0, -1.0], errors)
-    filters = reduced(replace(readout, coefficients=large), samples([readout.design.fine])[0])
+    filters = reduced(replace(readout, coefficients=large), readout.design.fine.sample())
     z, estimates = filters.S @ v[0], []
     for row in v:
         estimates.append(filters.C @ z + filters.D @ row)
@@ -158,7 +159,7 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     others = [k for k in recordings.keys if k.unit != key.unit and k.episode != key.episode]
     alone = replace(recordings, keys=tuple(others), lengths=recordings.lengths[: len(others)])
     made = design(alone, settings=settings)
-    (whitening,) = Whitening.of([readout.design])
+    whitening = Whitening.of(readout.design)
     (moments,) = Moments.of([made], [whitening])
     (coefficients,) = moments.solved(np.ones(len(moments.groups)), [tuple(readout.penalties[1])])
     group = readout.design.groups[key]
@@ -189,13 +190,13 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     recordings, batches = plant(units=3, spread=0.1)
     biased = replace(recordings, bias=np.array([0.5]))
     made = design(biased)
-    bank, X = made.bank, samples([made])[0][0]
+    bank, X = made.bank, made.sample()[0]
     expected = np.zeros_like(X)
     of_y = np.flatnonzero(bank.channel == 0)
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (len(bank.taps) - 2))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = samples([replace(made, shown=lambda y: y + 0.5)])[0][0] - X
+    moved = made.errors(X)[0][-1][1]
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
@@ -385,7 +386,7 @@ def test_errors_of_bridged_gaps_count_more_where_losses_need_it():
 def test_candidates_are_compared_without_groups_in_which_a_state_rests():
     recordings, _ = plant(units=3, episodes=3, spread=0.1)
     made = design(recordings, settings=FEW.model_copy(update={"parts": 3}))
-    (moments,) = Moments.of([made], Whitening.of([made]))
+    (moments,) = Moments.of([made], [Whitening.of(made)])
     parts = moments.of_groups("part")
     errors = np.zeros((len(parts), 4, 3))
     errors[:, 2:] = 0.1  # the other penalty is no better

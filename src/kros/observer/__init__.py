@@ -15,7 +15,7 @@ from ..core import refusing
 from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
 from .estimator.build import identify_estimator
-from .estimator.regression import Recordings, spread
+from .estimator.rows import Recordings, spread
 from .estimator.settings import EstimatorSettings
 from .observer import Observer
 from .residual import like_measurement_noise, one_step_covariance, one_step_residual

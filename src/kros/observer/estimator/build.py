@@ -19,7 +19,8 @@ from .certificate import outside_percent
 from .channels import FAMILIES, channels_of
 from .gaps import decay_of, loss_growth, with_gaps
 from .reduction import Filters, reduced
-from .regression import Design, Readout, Recordings, is_less, samples
+from .regression import Readout, is_less
+from .rows import Design, Recordings
 from .settings import EstimatorSettings
 
 
@@ -90,7 +91,7 @@ def identify_estimator(
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
         return assembled(name, lifting, inputs, readout.design, (filters, fallback), sample_period_s, parameters or {})
 
-    fine, blind_fine = samples([readout.design.fine, blind.design.fine])
+    fine, blind_fine = (one.design.fine.sample() for one in (readout, blind))
 
     def filters_of(one: Readout, other: Readout, orders: Sequence[int | None]) -> tuple[Filters, Filters]:
         both = np.hstack([one.coefficients, one.begun])

@@ -11,7 +11,7 @@ from ...core import TINY, Array, Flags, Parameters
 from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
 from ..simulate import Course
-from .regression import Recordings
+from .rows import Recordings
 from .settings import EstimatorSettings
 
 _NEVER = 1e12  # samples: an age that no gap has

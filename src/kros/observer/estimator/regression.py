@@ -9,230 +9,17 @@ coefficients that know neither the unit nor its episodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from itertools import compress, product
-from typing import TypeVar
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
-from ...core import EPS, ROUNDING, AnyArray, Array, DataError, Flags, Whole, frozen
+from ...core import EPS, ROUNDING, AnyArray, Array, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
-from ...data import EpisodeBatch, EpisodeKey
-from .bank import Bank
-from .channels import Channels
-from .settings import EstimatorSettings
+from .rows import Design, Group, Recordings, in_step
 
-T = TypeVar("T", bound=Hashable)
-Read = Callable[[EpisodeKey], EpisodeBatch]
-Rows = tuple[EpisodeKey, Array, Array, Array]  # rows of the bank, targets and weights
-Shown = Callable[[Array], Array]  # from measurements (n_samples, q) to what the bank sees of them
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
-
-
-@dataclass(frozen=True)
-class Group:
-    """Episodes whose moments are summed: a part of those of a fold of units in a condition."""
-
-    fold: int
-    condition: str
-    part: int
-
-
-@frozen
-class Recordings:
-    """Training episodes, read one by one.
-
-    Parameters
-    ----------
-    keys : tuple of EpisodeKey
-    lengths : tuple of int
-        Samples of every episode.
-    read : callable
-        Returns the `EpisodeBatch` of one key.
-    size : ndarray, shape (n,)
-        Sizes of the recorded states.
-    ranges : tuple of ndarray, shape (n + m,)
-        Least and largest values of states and inputs.
-    bias : ndarray, optional
-        Offsets of the measured states that their sensors may have at run time, of either sign, shape (q,).
-
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.observer import Recordings
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
-    >>> len(recordings.keys), recordings.size.shape
-    (4, (3,))
-    """
-
-    keys: tuple[EpisodeKey, ...]
-    lengths: tuple[int, ...]
-    read: Read
-    size: Array
-    ranges: tuple[Array, Array]
-    bias: Array | None = None
-
-    @classmethod
-    def of(cls, keys: Sequence[EpisodeKey], read: Read, bias: Array | None = None) -> Recordings:
-        """Return the episodes with their lengths and the sizes of their states."""
-        extents, n = [], 0
-        for batch in map(read, keys):
-            values, n = np.concatenate([batch.states, batch.inputs], axis=-1)[:, 0], batch.states.shape[-1]
-            extents.append((len(values), values.min(axis=0), values.max(axis=0)))
-        lengths, lows, highs = zip(*extents, strict=True)
-        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-        size = np.maximum(np.abs(low), np.abs(high))[:n]
-        size[size == 0] = 1.0
-        return cls(tuple(keys), lengths, read, size, (low, high), bias)
-
-    @property
-    def length(self) -> float:
-        """Median length of an episode in samples."""
-        return float(np.median(self.lengths))
-
-    def some(self, count: int, groups: Mapping[EpisodeKey, Group] | None = None) -> Recordings:
-        """Return some episodes, spread over all or over those of every group, and one of each at least."""
-        members: dict[Group | None, list[EpisodeKey]] = {}
-        for key in self.keys:
-            members.setdefault((groups or {}).get(key), []).append(key)
-        share = min(1.0, count / len(self.keys))
-        kept = {key for keys in members.values() for key in spread(keys, max(1, round(share * len(keys))))}
-        return self.only([key in kept for key in self.keys])
-
-    def only(self, which: Sequence[bool]) -> Recordings:
-        """Return the episodes that are flagged."""
-        return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
-
-
-def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[Whole, Array]]:
-    """Yield which samples of every episode are about so many rows, and for how many each stands.
-
-    Each has a sample after it. At the start they are denser than later.
-    """
-    first = min(first, min(lengths) - 1)
-    early = max(1, -(-3 * len(lengths) * first // rows))
-    late = max(1, -(-sum(lengths) // max(1, rows - len(lengths) * (first // early))))
-    for number, length in enumerate(lengths):
-        parts = np.arange(number % early, first, early), np.arange(first + number % late, length - 1, late)
-        yield np.concatenate(parts), np.repeat([float(early), float(late)], [len(part) for part in parts])
-
-
-def interpolated(y: Array) -> Array:
-    """Return measurements (n_samples, q) with straight lines over those that are missing."""
-    if np.isfinite(y).all():
-        return y
-    filled = y.copy()
-    for column in filled.T:
-        there = np.isfinite(column)
-        if not there.any():
-            raise DataError("Estimator: no sample of a measurement arrives in a training episode; leave it out.")
-        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
-    return filled
-
-
-def bridged(y: Array) -> Array:
-    """Return measurements (n_samples, q) with straight lines over half of the samples, lost at random."""
-    lost = np.random.default_rng(0).random(len(y)) < 0.5
-    return interpolated(np.where(lost[:, None], np.nan, y))
-
-
-@frozen
-class Design:
-    """A bank of channels with the recordings that it is fitted to: the rows of the regression."""
-
-    channels: Channels
-    bank: Bank
-    recordings: Recordings
-    settings: EstimatorSettings
-    shown: Shown = interpolated
-    late: bool = False  # whether rows are of samples after a random one of every episode
-    fresh: bool = True  # whether the bank starts there, too
-
-    @classmethod
-    def of(
-        cls, channels: Channels, recordings: Recordings, settings: EstimatorSettings, poles: Sequence[complex] = ()
-    ) -> Design:
-        """Return the design with the bank of its channels, and of poles of the machines."""
-        return cls(channels, Bank.of(channels, recordings.length, settings, poles), recordings, settings)
-
-    def rows(self, recordings: Recordings, rows: int) -> Iterator[Rows]:
-        """Yield episode, bank rows, targets and weights of every episode, with measurements as they are shown.
-
-        Targets are states at the next sample, of measured ones their distance from the reference of the channels.
-        """
-        first = round(self.settings.start_rows * max(self.settings.start, default=0.0))
-        samples = thinned(recordings.lengths, rows, first)
-        measured, rng = list(self.channels.measured), np.random.default_rng(self.settings.seed)
-        for key, (at, weights) in zip(recordings.keys, samples, strict=True):
-            states, y, v = self.episode(recordings.read(key))
-            begin = int(rng.integers(0, len(v) // 2)) if self.late else 0
-            after = np.minimum(at, len(v) - begin - 2)
-            at = begin + after
-            seen = self.bank.rows(self.channels.filtered(v[begin:] if self.fresh else v), after if self.fresh else at)
-            targets = states[at + 1] / recordings.size
-            reference = v[at] @ self.channels.reference.T
-            reference[:, self.channels.held] = y[at][:, self.channels.held]
-            targets[:, measured] -= reference / recordings.size[measured]
-            yield key, seen, targets, weights
-
-    def episode(self, batch: EpisodeBatch) -> tuple[Array, Array, Array]:
-        """Return states, measurements as they are shown, and channels of an episode, (n_samples, .)."""
-        length, own = batch.lengths[0], {k: p[0] for k, p in batch.parameters.items()}
-        y = self.shown(batch.measurements(self.channels.measured)[:length, 0])
-        return batch.states[:length, 0], y, self.channels.signals(y, batch.inputs[:length, 0], own)
-
-    def signals(self, some: int, length: int) -> Array:
-        """Return what filters see in some episodes, cut to one length, shape (n_samples, batch, channels)."""
-        recordings = self.recordings.some(some)
-        shortest = min(length, *recordings.lengths)
-        channels = (self.episode(batch)[2] for batch in map(recordings.read, recordings.keys))
-        return np.stack([self.channels.filtered(v)[:shortest] for v in channels], axis=1)
-
-    @cached_property
-    def groups(self) -> dict[EpisodeKey, Group]:
-        """The group of every episode: those of one name are in one part, and a unit is in one fold."""
-        keys, folds, parts = self.recordings.keys, self.settings.folds, self.settings.parts
-        names, units = (sorted(set(column)) for column in zip(*((k.episode, k.unit) for k in keys), strict=True))
-        return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
-
-    @property
-    def errors(self) -> list[tuple[float, Design, Design]]:
-        """Errors that rows may have: their weights, designs that see them, and the same without."""
-        bias, seen = self.recordings.bias, list[tuple[float, Shown]]()
-        if not self.channels.inputs_only:
-            seen.append((self.settings.gap_share, bridged))
-        if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
-            seen.append((1.0, lambda y: interpolated(y) + bias))
-        errors = [(share, replace(self, shown=shown), self) for share, shown in seen]
-        late = replace(self, late=True)
-        return [*errors, (1.0, late, replace(late, fresh=False))]
-
-    @property
-    def fine(self) -> Design:
-        """The design of the bank with every delay."""
-        return replace(self, bank=self.bank.fine)
-
-
-def in_step(designs: Sequence[Design], recordings: Recordings, rows: int) -> Iterator[tuple[Rows, ...]]:
-    """Yield what `Design.rows` yields of several designs, episode by episode: each is read once."""
-    once = replace(recordings, read=lru_cache(maxsize=1)(recordings.read))
-    return zip(*(design.rows(once, rows) for design in designs), strict=True)
-
-
-def samples(designs: Sequence[Design]) -> list[tuple[Array, Array]]:
-    """Return thinned rows of the bank of every design, and weights that sum to one."""
-    recordings, settings = designs[0].recordings, designs[0].settings
-    parts, weights = [list[Array]() for _ in designs], list[Array]()
-    for episode in in_step(designs, recordings.some(settings.episodes // 2), settings.sample):
-        weights.append(episode[0][-1])
-        for of_one, (_, rows, *_) in zip(parts, episode, strict=True):
-            of_one.append(rows)
-    weight = np.concatenate(weights)
-    return [(np.vstack(parts.pop(0)), weight / weight.sum()) for _ in designs]  # one design after the other: memory
 
 
 @frozen
@@ -246,28 +33,17 @@ class Whitening:
     restart: Array  # (r, r), the same of starts in the middle of an episode
 
     @classmethod
-    def of(cls, designs: Sequence[Design]) -> list[Whitening]:
-        """Find the directions of every design, one design after the other: memory."""
-        found = []
-        for design in designs:
-            errors = design.errors
-            sample, *others = samples([design, *(one for _, *pair in errors for one in pair)])
-            pairs = iter(others)
-            wrong = [(share, next(pairs)[0] - next(pairs)[0]) for share, *_ in errors]
-            found.append(cls._found(design, sample, wrong))
-        return found
-
-    @classmethod
-    def _found(cls, design: Design, sample: tuple[Array, Array], errors: Sequence[tuple[float, Array]]) -> Whitening:
+    def of(cls, design: Design) -> Whitening:
         """Find the directions from thinned rows, and what rows with errors of weights add."""
-        X, weights = sample
+        X, weights = sample = design.sample()
         bank, settings = design.bank, design.settings
         size = bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
+        errors, restarts = design.errors(X)
         trust = np.diag(bank.trust(settings.nonlinear_trust))
-        for share, wrong in errors[:-1]:
+        for share, wrong in errors:
             trust = np.vstack([trust, qr_triangle(wrong * scale * np.sqrt(share))])
-        restart = qr_triangle(errors[-1][1] * scale)
+        restart = qr_triangle(restarts * scale)
         least = np.sqrt(settings.settled_share) * restart
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, least])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
@@ -371,7 +147,9 @@ class Readout:
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Readout]:
         """Fit all states by every design, in two passes over the recordings."""
-        return [cls._fitted(*each) for each in zip(designs, Moments.of(designs, Whitening.of(designs)), strict=True)]
+        return [
+            cls._fitted(*each) for each in zip(designs, Moments.of(designs, [*map(Whitening.of, designs)]), strict=True)
+        ]
 
     @classmethod
     def _fitted(cls, design: Design, moments: Moments) -> Readout:
@@ -424,11 +202,6 @@ class Readout:
         for key, rows, targets, weights in design.rows(design.recordings, design.settings.rows):
             found.append(np.average((targets - rows @ self.others[design.groups[key]]) ** 2, axis=0, weights=weights))
         return np.array(found)
-
-
-def spread(items: Sequence[T], count: int) -> list[T]:
-    """Return so many items, evenly spaced from the first to the last."""
-    return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
 
 
 def is_less(one: Array, other: Array, margin: float) -> bool:

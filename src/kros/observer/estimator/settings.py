@@ -47,6 +47,7 @@ class EstimatorSettings(Settings):
     rows: int = Field(60_000, ge=1000, description="rows of the regression; more are thinned evenly")
     episodes: int = Field(300, ge=4, description="episodes of the regression; of more, some evenly spread over all")
     sample: int = Field(8_000, ge=1000, description="rows from which principal directions and covariances are found")
+    sample_episodes: int = Field(60, ge=2, description="episodes of these rows")
     penalties: tuple[float, ...] = Field(
         tuple(10.0**decade for decade in range(-16, 1, 2)),
         min_length=1,

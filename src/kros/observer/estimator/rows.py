@@ -1,0 +1,238 @@
+"""Rows of the regression: the bank along training episodes, targets, and what errors of measurements do to rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import compress
+from typing import TypeVar
+
+import numpy as np
+
+from ...core import Array, DataError, Whole, frozen
+from ...data import EpisodeBatch, EpisodeKey
+from .bank import Bank
+from .channels import Channels
+from .settings import EstimatorSettings
+
+T = TypeVar("T", bound=Hashable)
+Read = Callable[[EpisodeKey], EpisodeBatch]
+Rows = tuple[EpisodeKey, Array, Array, Array]  # rows of the bank, targets and weights
+
+
+@dataclass(frozen=True)
+class Group:
+    """Episodes whose moments are summed: a part of those of a fold of units in a condition."""
+
+    fold: int
+    condition: str
+    part: int
+
+
+@frozen
+class Recordings:
+    """Training episodes, read one by one.
+
+    Parameters
+    ----------
+    keys : tuple of EpisodeKey
+    lengths : tuple of int
+        Samples of every episode.
+    read : callable
+        Returns the `EpisodeBatch` of one key.
+    size : ndarray, shape (n,)
+        Sizes of the recorded states.
+    ranges : tuple of ndarray, shape (n + m,)
+        Least and largest values of states and inputs.
+    bias : ndarray, optional
+        Offsets of the measured states that their sensors may have at run time, of either sign, shape (q,).
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.observer import Recordings
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
+    >>> len(recordings.keys), recordings.size.shape
+    (4, (3,))
+    """
+
+    keys: tuple[EpisodeKey, ...]
+    lengths: tuple[int, ...]
+    read: Read
+    size: Array
+    ranges: tuple[Array, Array]
+    bias: Array | None = None
+
+    @classmethod
+    def of(cls, keys: Sequence[EpisodeKey], read: Read, bias: Array | None = None) -> Recordings:
+        """Return the episodes with their lengths and the sizes of their states."""
+        extents, n = [], 0
+        for batch in map(read, keys):
+            values, n = np.concatenate([batch.states, batch.inputs], axis=-1)[:, 0], batch.states.shape[-1]
+            extents.append((len(values), values.min(axis=0), values.max(axis=0)))
+        lengths, lows, highs = zip(*extents, strict=True)
+        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+        size = np.maximum(np.abs(low), np.abs(high))[:n]
+        size[size == 0] = 1.0
+        return cls(tuple(keys), lengths, read, size, (low, high), bias)
+
+    @property
+    def length(self) -> float:
+        """Median length of an episode in samples."""
+        return float(np.median(self.lengths))
+
+    def some(self, count: int, groups: Mapping[EpisodeKey, Group] | None = None) -> Recordings:
+        """Return some episodes, spread over all or over those of every group, and one of each at least."""
+        members: dict[Group | None, list[EpisodeKey]] = {}
+        for key in self.keys:
+            members.setdefault((groups or {}).get(key), []).append(key)
+        share = min(1.0, count / len(self.keys))
+        kept = {key for keys in members.values() for key in spread(keys, max(1, round(share * len(keys))))}
+        return self.only([key in kept for key in self.keys])
+
+    def only(self, which: Sequence[bool]) -> Recordings:
+        """Return the episodes that are flagged."""
+        return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
+
+
+def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[Whole, Array]]:
+    """Yield which samples of every episode are about so many rows, and for how many each stands.
+
+    Each has a sample after it. At the start they are denser than later.
+    """
+    first = min(first, min(lengths) - 1)
+    early = max(1, -(-3 * len(lengths) * first // rows))
+    late = max(1, -(-sum(lengths) // max(1, rows - len(lengths) * (first // early))))
+    for number, length in enumerate(lengths):
+        parts = np.arange(number % early, first, early), np.arange(first + number % late, length - 1, late)
+        yield np.concatenate(parts), np.repeat([float(early), float(late)], [len(part) for part in parts])
+
+
+def interpolated(y: Array) -> Array:
+    """Return measurements (n_samples, q) with straight lines over those that are missing."""
+    if np.isfinite(y).all():
+        return y
+    filled = y.copy()
+    for column in filled.T:
+        there = np.isfinite(column)
+        if not there.any():
+            raise DataError("Estimator: no sample of a measurement arrives in a training episode; leave it out.")
+        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
+    return filled
+
+
+def bridged(y: Array) -> Array:
+    """Return measurements (n_samples, q) with straight lines over half of the samples, lost at random."""
+    lost = np.random.default_rng(0).random(len(y)) < 0.5
+    return interpolated(np.where(lost[:, None], np.nan, y))
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """Return so many items, evenly spaced from the first to the last."""
+    return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
+
+
+@frozen
+class Design:
+    """A bank of channels with the recordings that it is fitted to: the rows of the regression."""
+
+    channels: Channels
+    bank: Bank
+    recordings: Recordings
+    settings: EstimatorSettings
+
+    @classmethod
+    def of(
+        cls, channels: Channels, recordings: Recordings, settings: EstimatorSettings, poles: Sequence[complex] = ()
+    ) -> Design:
+        """Return the design with the bank of its channels, and of poles of the machines."""
+        return cls(channels, Bank.of(channels, recordings.length, settings, poles), recordings, settings)
+
+    def thinned(self, recordings: Recordings, rows: int) -> Iterator[tuple[EpisodeKey, EpisodeBatch, Whole, Array]]:
+        """Yield every episode with the samples that are rows, and their weights."""
+        first = round(self.settings.start_rows * max(self.settings.start, default=0.0))
+        for key, (at, weights) in zip(recordings.keys, thinned(recordings.lengths, rows, first), strict=True):
+            yield key, recordings.read(key), at, weights
+
+    def rows(self, recordings: Recordings, rows: int) -> Iterator[Rows]:
+        """Yield episode, bank rows, targets and weights of every episode.
+
+        Targets are states at the next sample, of measured ones their distance from the reference of the channels.
+        """
+        measured = list(self.channels.measured)
+        for key, batch, at, weights in self.thinned(recordings, rows):
+            y = self.measurements(batch)
+            v = self.signals(batch, y)
+            targets = batch.states[at + 1, 0] / recordings.size
+            reference = v[at] @ self.channels.reference.T
+            reference[:, self.channels.held] = y[at][:, self.channels.held]
+            targets[:, measured] -= reference / recordings.size[measured]
+            yield key, self.seen(v, at), targets, weights
+
+    def sample(self) -> tuple[Array, Array]:
+        """Return thinned rows of the bank of some episodes, and weights that sum to one."""
+        settings = self.settings
+        found = list(self.rows(self.recordings.some(settings.sample_episodes), settings.sample))
+        weight = np.concatenate([weights for *_, weights in found])
+        return np.vstack([rows for _, rows, *_ in found]), weight / weight.sum()
+
+    def errors(self, rows: Array) -> tuple[list[tuple[float, Array]], Array]:
+        """Return by how much rows of `sample` may be wrong, with weights; apart, by a start in mid-episode."""
+        settings, bias, rng = self.settings, self.recordings.bias, np.random.default_rng(self.settings.seed)
+        faults: list[tuple[float, Callable[[Array], Array]]] = []
+        if not self.channels.inputs_only:
+            faults.append((settings.gap_share, bridged))
+        if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
+            faults.append((1.0, lambda y: y + bias))
+        wrong, restarts = [list[Array]() for _ in faults], list[Array]()
+        for _, batch, at, _ in self.thinned(self.recordings.some(settings.sample_episodes), settings.sample):
+            y = self.measurements(batch)
+            for found, (_, fault) in zip(wrong, faults, strict=True):
+                found.append(self.seen(self.signals(batch, fault(y)), at))
+            v = self.signals(batch, y)
+            begin = int(rng.integers(0, len(v) // 2))
+            after = np.minimum(at, len(v) - begin - 2)
+            restarts.append(self.seen(v[begin:], after) - self.seen(v, begin + after))
+        errors = [(share, np.vstack(found) - rows) for (share, _), found in zip(faults, wrong, strict=True)]
+        return errors, np.vstack(restarts)
+
+    def measurements(self, batch: EpisodeBatch) -> Array:
+        """Return the measurements of an episode, (n_samples, q), with straight lines over missing ones."""
+        return interpolated(batch.measurements(self.channels.measured)[: batch.lengths[0], 0])
+
+    def signals(self, batch: EpisodeBatch, y: Array) -> Array:
+        """Return the channels of an episode with measurements y, (n_samples, channels)."""
+        own = {name: values[0] for name, values in batch.parameters.items()}
+        return self.channels.signals(y, batch.inputs[: len(y), 0], own)
+
+    def seen(self, v: Array, at: Whole) -> Array:
+        """Return what the bank holds at samples of channels v, shape (len(at), len(self.bank))."""
+        return self.bank.rows(self.channels.filtered(v), at)
+
+    def filtered(self, some: int, length: int) -> Array:
+        """Return what filters see in some episodes, cut to one length, shape (n_samples, batch, channels)."""
+        recordings = self.recordings.some(some)
+        shortest = min(length, *recordings.lengths)
+        channels = (self.signals(batch, self.measurements(batch)) for batch in map(recordings.read, recordings.keys))
+        return np.stack([self.channels.filtered(v)[:shortest] for v in channels], axis=1)
+
+    @cached_property
+    def groups(self) -> dict[EpisodeKey, Group]:
+        """The group of every episode: those of one name are in one part, and a unit is in one fold."""
+        keys, folds, parts = self.recordings.keys, self.settings.folds, self.settings.parts
+        names, units = (sorted(set(column)) for column in zip(*((k.episode, k.unit) for k in keys), strict=True))
+        return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
+
+    @property
+    def fine(self) -> Design:
+        """The design of the bank with every delay."""
+        return replace(self, bank=self.bank.fine)
+
+
+def in_step(designs: Sequence[Design], recordings: Recordings, rows: int) -> Iterator[tuple[Rows, ...]]:
+    """Yield what `Design.rows` yields of several designs, episode by episode: each is read once."""
+    once = replace(recordings, read=lru_cache(maxsize=1)(recordings.read))
+    return zip(*(design.rows(once, rows) for design in designs), strict=True)

@@ -62,7 +62,7 @@ typedef struct {
     double *past;             /* (observers, batch, earlier), moved on */
     const double *reach;      /* (recorded) */
     const double *bank;       /* (4, recorded, batch): half, recovery, longest age, recovery of a start */
-    double *gap;              /* (recorded + q + 1 + q filters, batch): age, count, age of the start, ramps; moved on */
+    double *gap;              /* (recorded + q + 1 + q filters, batch): age, count, age of the start or the last loss, ramps; moved on */
     double *states;           /* (samples, observers, n, batch): x before every sample; none */
 } relift_job;
 
@@ -293,7 +293,8 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
         vec *start = gap + (recorded + q) * MOST + v;
-        const vec begun = *start * *start / (1.0 + *start * *start);
+        *start = either(some, (vec){0} + 0.1 * exp(5.0), *start);
+        const vec begun = level(*start, (vec){0} + 1.0);
         *start *= bank[3 * recorded * MOST + v];
         for (whole i = 0; i < recorded; i++) {
             const whole at = i * MOST + v;

@@ -115,12 +115,13 @@ class Gaps:
         recovered = np.where(some[:, None], self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
         age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
-        recorded += self.start**2 / (1 + self.start**2) * (following[:, self.after_start] - recorded)
+        disturbed = np.where(some[:, None], longest_age(np.ones(1)), self.start)
+        recorded += disturbed**2 / (1 + disturbed**2) * (following[:, self.after_start] - recorded)
         recorded += self.hidden * bank.level(age) * (fallback - recorded)
         if some.any() or self.count.any():
             ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
             self.ramp[...] = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)
-        self.age[...], self.count[...], self.start[...] = age, count, self.start * bank.start_recovery
+        self.age[...], self.count[...], self.start[...] = age, count, disturbed * bank.start_recovery
 
     @property
     def job(self) -> Record:

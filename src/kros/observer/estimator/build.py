@@ -17,7 +17,7 @@ from ..observer import Observer
 from ..runtime import Runtime
 from .certificate import outside_percent
 from .channels import FAMILIES, channels_of
-from .gaps import decay_of, loss_growth, with_gaps
+from .gaps import decay_of, with_gaps
 from .reduction import Filters, reduced
 from .regression import Readout, is_less
 from .rows import Design, Recordings
@@ -94,7 +94,7 @@ def identify_estimator(
     fine, blind_fine = (one.design.fine.sample() for one in (readout, blind))
 
     def filters_of(one: Readout, other: Readout, orders: Sequence[int | None]) -> tuple[Filters, Filters]:
-        both = np.hstack([one.coefficients, one.begun])
+        both = np.hstack([one.coefficients, one.careful])
         return reduced(one, fine, orders[0], both), reduced(other, blind_fine, orders[1])
 
     filters, fallback = filters_of(readout, blind, [settings.order] * 2)
@@ -107,11 +107,6 @@ def identify_estimator(
     assert observer.bank is not None
     assert trial.bank is not None
     bank = with_gaps(observer.bank, trial, F, unseen, settings)
-    trial = replace(trial, bank=replace(bank, start=trial.bank.start))
-    if 0 < settings.gap_share < 1 and loss_growth(trial, unseen, settings) > settings.lost_growth:
-        heavier = settings.model_copy(update={"gap_share": 10 * settings.gap_share})
-        same = name, lifting, measured, inputs, recordings, sample_period_s, parameters
-        return identify_estimator(*same, heavier, poles)
     observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings))
     states = lifting.states
 
@@ -124,7 +119,6 @@ def identify_estimator(
     facts = {
         "channels": family,
         "filters": len(filters.A),
-        "gap_share": settings.gap_share,
         "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},

@@ -130,20 +130,6 @@ def decay_of(observer: Observer, recordings: Recordings, settings: EstimatorSett
     return F
 
 
-def loss_growth(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> float:
-    """Return by which ratio errors that count grow at most where measurements are lost independently, up to a share."""
-    n, at = len(observer.recorded), list(observer.measured)
-    states, y, inputs, own = training(observer, recordings, settings)
-    shares = settings.lost * np.arange(1, 1 + y.shape[1]) / y.shape[1]
-    lost = np.random.default_rng(settings.seed).random(y.shape[:2]) < shares
-    lost[0] = False
-    shown = y, np.where(lost[..., None], np.nan, y)
-    off = [recorded_estimates(observer, one, inputs, own)[..., :n] - states for one in shown]
-    some = [i for i in range(n) if i not in at] or at
-    right, wrong = (np.mean((one[..., some] / recordings.size[some]) ** 2, axis=(0, 1)) for one in off)
-    return float(np.sqrt((wrong / np.maximum(right, settings.negligible**2)).max()))
-
-
 def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Parameters) -> Array:
     """Return the estimates of recorded states and those from inputs alone, (n_samples, batch, 2 n)."""
     course, n = Course(observer, y.shape[1], parameters), len(observer.recorded)

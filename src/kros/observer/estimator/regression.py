@@ -138,11 +138,12 @@ class Readout:
     design: Design
     sample: tuple[Array, Array]  # thinned rows of the bank, with their weights
     coefficients: Array  # (p, n)
-    begun: Array  # (p, n), with the weight of restarts for the time after a start
+    careful: Array  # (p, n), for the time after a start or a loss
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
     penalties: Array  # (n, 2), and weights of restarts
     others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
+    careful_others: dict[Group, Array]
 
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Readout]:
@@ -160,18 +161,21 @@ class Readout:
         others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         errors = np.array(left_out)
-        n, (best, first) = np.arange(errors.shape[2]), moments.best(np.log(errors), 2)
+        n, (best, careful) = np.arange(errors.shape[2]), moments.best(np.log(errors), 2)
         every = np.array(list(moments.solved(weights, candidates)))
-        coefficients, begun = (every[one, :, n].T for one in (best, first))
+        coefficients = every[best, :, n].T
         return cls(
             design,
             whitening.sample,
             whitening.directions @ coefficients * design.recordings.size,
-            whitening.directions @ begun * design.recordings.size,
+            whitening.directions @ every[careful, :, n].T * design.recordings.size,
             errors[:, best, n],
             moments.errors(coefficients),
             np.array(candidates)[best],
-            {g: whitening.directions @ np.array(each)[best, :, n].T for g, each in others.items()},
+            *(
+                {g: whitening.directions @ np.array(each)[of, :, n].T for g, each in others.items()}
+                for of in (best, careful)
+            ),
         )
 
     def left_out_group(self) -> tuple[Group, Recordings]:
@@ -188,8 +192,8 @@ class Readout:
 
     def without(self, group: Group) -> Readout:
         """Return the readout that does not know a group."""
-        coefficients = self.others[group] * self.design.recordings.size
-        return replace(self, coefficients=coefficients, begun=coefficients)
+        size = self.design.recordings.size
+        return replace(self, coefficients=self.others[group] * size, careful=self.careful_others[group] * size)
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""

@@ -68,16 +68,24 @@ class Recordings:
 
     @classmethod
     def of(cls, keys: Sequence[EpisodeKey], read: Read, bias: Array | None = None) -> Recordings:
-        """Return the episodes with their lengths and the sizes of their states."""
+        """Return the episodes with their lengths and the sizes of their states; units by how far they move.
+
+        So their names and their order do not matter.
+        """
         extents, n = [], 0
         for batch in map(read, keys):
             values, n = np.concatenate([batch.states, batch.inputs], axis=-1)[:, 0], batch.states.shape[-1]
-            extents.append((len(values), values.min(axis=0), values.max(axis=0)))
-        lengths, lows, highs = zip(*extents, strict=True)
+            extents.append((len(values), values.min(axis=0), values.max(axis=0), values[:, :n].std(axis=0)))
+        lengths, lows, highs, motions = zip(*extents, strict=True)
         low, high = np.min(lows, axis=0), np.max(highs, axis=0)
         size = np.maximum(np.abs(low), np.abs(high))[:n]
         size[size == 0] = 1.0
-        return cls(tuple(keys), lengths, read, size, (low, high), bias)
+        moved = dict.fromkeys((key.unit for key in keys), 0.0)
+        for key, motion in zip(keys, motions, strict=True):
+            moved[key.unit] += float(np.sum(motion / size))
+        order = sorted(range(len(keys)), key=lambda i: moved[keys[i].unit])
+        ordered = tuple(keys[i] for i in order), tuple(lengths[i] for i in order)
+        return cls(*ordered, read, size, (low, high), bias)
 
     @property
     def length(self) -> float:
@@ -223,7 +231,7 @@ class Design:
     def groups(self) -> dict[EpisodeKey, Group]:
         """The group of every episode: those of one name are in one part, and a unit is in one fold."""
         keys, folds, parts = self.recordings.keys, self.settings.folds, self.settings.parts
-        names, units = (sorted(set(column)) for column in zip(*((k.episode, k.unit) for k in keys), strict=True))
+        names, units = sorted({k.episode for k in keys}), list(dict.fromkeys(k.unit for k in keys))
         return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
 
     @property

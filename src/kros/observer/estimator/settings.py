@@ -71,11 +71,6 @@ class EstimatorSettings(Settings):
         description="weight of the errors that straight lines over lost measurements make, half of them: rows with "
         "target zero, which bound the gains of filters on smooth recordings; ten times as much where losses need it",
     )
-    lost: float = Field(0.3, gt=0, lt=1, description="share of independent losses that errors have to stand, at most")
-    lost_growth: float = Field(2.0, gt=1, description="ratio by which these may increase errors on units left out")
-    negligible: float = Field(
-        0.01, gt=0, description="share of a state's largest value below which errors do not count"
-    )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"
     )

@@ -2,8 +2,8 @@ r"""What makes an observer a filter bank: how it starts, and what replaces missi
 
 While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its
 internal states are the filters z of measurements and inputs, whose estimate is given then, a second estimate
-:math:`x^s` from these for the time after a start, the filters w of inputs alone, their own estimate :math:`x^u` of all
-recorded states, and the distance o from it, which decays as machines do by themselves. Before a step
+:math:`x^s` from these for the time after a start or a loss, the filters w of inputs alone, their own estimate
+:math:`x^u` of all recorded states, and the distance o from it, which decays as machines do by themselves. Before a step
 
 .. math:: o_k \leftarrow o_k + (1 - m) (x_k - x^u_k - o_k), \qquad o_{k+1} = F o_k,
 
@@ -17,8 +17,9 @@ one percent after five time constants of :math:`\mu`. The estimate of a state th
 
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
-After a start, what happened before is not known. There :math:`x + m (x^s - x)` takes the place of x, with an age that
-falls from :math:`0.1 e^5 T` on as the slowest filter forgets, and T = 1.
+After a start, what happened before is not known; after a loss, filters hold what stood for measurements. There
+:math:`x + m (x^s - x)` takes the place of x, with an age that falls from :math:`0.1 e^5 T` on as the slowest filter
+forgets, and T = 1.
 
 A missing measurement is replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback, and o of
 states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so

@@ -93,15 +93,15 @@ def identify_estimator(
 
     fine, blind_fine = (one.design.fine.sample() for one in (readout, blind))
 
-    def filters_of(one: Readout, other: Readout, orders: Sequence[int | None]) -> tuple[Filters, Filters]:
+    def filters_of(one: Readout, other: Readout) -> tuple[Filters, Filters]:
         both = np.hstack([one.coefficients, one.careful])
-        return reduced(one, fine, orders[0], both), reduced(other, blind_fine, orders[1])
+        return reduced(one, fine, settings.order, both), reduced(other, blind_fine, settings.order)
 
-    filters, fallback = filters_of(readout, blind, [settings.order] * 2)
+    filters, fallback = filters_of(readout, blind)
     observer = observer_of(filters, fallback)
     group, unseen = readout.left_out_group()
-    orders = len(filters.A), len(fallback.A)
-    trial = observer_of(*filters_of(readout.without(group), blind.without(group), orders))
+    trial = observer_of(*filters_of(readout.without(group), blind.without(group)))
+
     F = decay_of(observer, recordings, settings, held)
     observer, trial = let_go(observer, F), let_go(trial, F)
     assert observer.bank is not None

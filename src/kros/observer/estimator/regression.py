@@ -30,7 +30,7 @@ class Whitening:
     directions: Array  # (p, r)
     penalty: Array  # (r,), 1 / sigma^2
     trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
-    restart: Array  # (r, r), the same of starts in the middle of an episode
+    disturbed: Array  # (r, r), the same after a start in the middle of an episode or a loss
 
     @classmethod
     def of(cls, design: Design) -> Whitening:
@@ -39,16 +39,14 @@ class Whitening:
         bank, settings = design.bank, design.settings
         size = bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
-        errors, restarts = design.errors(X)
-        trust = np.diag(bank.trust(settings.nonlinear_trust))
-        for share, wrong in errors:
-            trust = np.vstack([trust, qr_triangle(wrong * scale * np.sqrt(share))])
-        restart = qr_triangle(restarts * scale)
-        least = np.sqrt(settings.settled_share) * restart
+        errors = [(one, other, qr_triangle(wrong * scale)) for one, other, wrong in design.errors(X)]
+        trust = np.vstack([np.diag(bank.trust(settings.nonlinear_trust)), *(np.sqrt(one) * R for one, _, R in errors)])
+        disturbed = np.vstack([np.sqrt(other) * R for _, other, R in errors])
+        least = np.sqrt(settings.settled_share) * disturbed
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, least])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
-        moments = (rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, restart)))
+        moments = (rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, disturbed)))
         return cls(sample, directions, sigma[:count] ** -2.0, *moments)
 
 
@@ -102,7 +100,7 @@ class Moments:
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 16 * len(gram) * EPS
         for penalty, share in candidates:
-            A = gram + share * whitening.restart + np.diag(penalty * whitening.penalty)
+            A = gram + share * whitening.disturbed + np.diag(penalty * whitening.penalty)
             q = 1 / np.sqrt(np.diag(A))
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)

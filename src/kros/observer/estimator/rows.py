@@ -132,12 +132,6 @@ def interpolated(y: Array) -> Array:
     return filled
 
 
-def bridged(y: Array) -> Array:
-    """Return measurements (n_samples, q) with straight lines over half of the samples, lost at random."""
-    lost = np.random.default_rng(0).random(len(y)) < 0.5
-    return interpolated(np.where(lost[:, None], np.nan, y))
-
-
 def spread(items: Sequence[T], count: int) -> list[T]:
     """Return so many items, evenly spaced from the first to the last."""
     return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
@@ -187,25 +181,32 @@ class Design:
         weight = np.concatenate([weights for *_, weights in found])
         return np.vstack([rows for _, rows, *_ in found]), weight / weight.sum()
 
-    def errors(self, rows: Array) -> tuple[list[tuple[float, Array]], Array]:
-        """Return by how much rows of `sample` may be wrong, with weights; apart, by a start in mid-episode."""
+    def errors(self, rows: Array) -> list[tuple[float, float, Array]]:
+        """Return by how much rows of `sample` may be wrong, with weights for all time and after a disturbance."""
         settings, bias, rng = self.settings, self.recordings.bias, np.random.default_rng(self.settings.seed)
-        faults: list[tuple[float, Callable[[Array], Array]]] = []
-        if not self.channels.inputs_only:
-            faults.append((settings.gap_share, bridged))
-        if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
-            faults.append((1.0, lambda y: y + bias))
-        wrong, restarts = [list[Array]() for _ in faults], list[Array]()
+        biased, lost, restarts = list[Array](), list[Array](), list[Array]()
         for _, batch, at, _ in self.thinned(self.recordings.some(settings.sample_episodes), settings.sample):
             y = self.measurements(batch)
-            for found, (_, fault) in zip(wrong, faults, strict=True):
-                found.append(self.seen(self.signals(batch, fault(y)), at))
             v = self.signals(batch, y)
             begin = int(rng.integers(0, len(v) // 2))
             after = np.minimum(at, len(v) - begin - 2)
             restarts.append(self.seen(v[begin:], after) - self.seen(v, begin + after))
-        errors = [(share, np.vstack(found) - rows) for (share, _), found in zip(faults, wrong, strict=True)]
-        return errors, np.vstack(restarts)
+            if not self.channels.inputs_only:
+                lost.append(self.seen(self.half_lost(batch, y), at))
+            if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
+                biased.append(self.seen(self.signals(batch, y + bias), at))
+        errors = [(0.0, 1.0, np.vstack(restarts))]
+        for share, again, wrong in ((settings.gap_share, settings.lost_share, lost), (1.0, 0.0, biased)):
+            errors += [(share, again, np.vstack(wrong) - rows)] if wrong else []
+        return errors
+
+    def half_lost(self, batch: EpisodeBatch, y: Array) -> Array:
+        """Return the channels where half of the samples is lost: straight lines, their functions of the last value."""
+        lost = np.random.default_rng(self.settings.seed).random(len(y)) < 0.5
+        lost[0] = False
+        v = self.signals(batch, y[np.maximum.accumulate(np.where(lost, 0, np.arange(len(y))))])
+        v[:, : y.shape[1]] = interpolated(np.where(lost[:, None], np.nan, y))
+        return v
 
     def measurements(self, batch: EpisodeBatch) -> Array:
         """Return the measurements of an episode, (n_samples, q), with straight lines over missing ones."""

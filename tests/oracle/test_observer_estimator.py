@@ -84,7 +84,7 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
         size = np.sqrt(sum(w.sum() for *_, w in own) * len(parts))
         X += [F * np.sqrt(w)[:, None] / size for F, _, w in own]
         T += [t * np.sqrt(w)[:, None] / size for _, t, w in own]
-    prior = whitening.trust + share * whitening.restart + penalty * np.diag(whitening.penalty)
+    prior = whitening.trust + share * whitening.disturbed + penalty * np.diag(whitening.penalty)
     root = np.linalg.cholesky(prior).T
     stacked = np.vstack([*X, root]), np.vstack([*T, np.zeros((len(root), 3))])
     np.testing.assert_allclose(found, np.linalg.lstsq(*stacked, rcond=None)[0], atol=1e-6 * np.abs(found).max())
@@ -196,7 +196,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (len(bank.taps) - 2))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = made.errors(X)[0][-1][1]
+    moved = made.errors(X)[-1][-1]
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
@@ -214,6 +214,7 @@ def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
     A, B, n = observer.A.copy(), observer.B.copy(), observer.lifting.n_states
     A[n - 6 : n], B[n - 6 : n] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses it linearly
     A[n - 3 : n, n - 3 : n] = np.eye(3)
+    A[n - 9 : n - 6], B[n - 9 : n - 6] = A[:3], B[:3]  # one readout for all time
     observer = replace(observer, bank=bank, A=A, B=B)
     y, u = np.linspace(0.0, 2.0, 200)[:, None, None], np.zeros((200, 1, 1))
     lost = y.copy()
@@ -375,12 +376,19 @@ def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_to
     assert errors[1][0] < 0.05 * speed
 
 
-def test_errors_of_bridged_gaps_count_more_where_losses_need_it():
-    recordings, _ = plant(units=3, spread=0.1)
-    for least, share in ((1.0, FEW.gap_share), (1e-9, 1.0)):
-        settings = FEW.model_copy(update={"lost_growth": 1.001, "negligible": least})
-        found = identify_estimator("plant", LIFTING, (0,), ("u",), recordings, DT, settings=settings)
-        assert found.facts["gap_share"] == pytest.approx(share)
+def test_a_readout_of_its_own_counts_after_a_loss_until_the_slowest_filter_has_forgotten(motors):
+    observer, batch = motors
+    y, n = batch.states[..., :1].copy(), observer.lifting.n_states
+    y[300] = np.nan
+    runs = []
+    for factor in (0.0, 1.0):
+        A, B = observer.A.copy(), observer.B.copy()
+        share = np.array([1.0, factor, factor])[:, None]  # substitutes are the same: the position
+        A[n - 9 : n - 6], B[n - 9 : n - 6] = share * A[:3], share * B[:3]
+        one = replace(observer, A=A, B=B, bank=replace(observer.bank, half=np.full(3, 1e12)))
+        runs.append(run_observer(one, y, batch.inputs)[303:, :, 1])
+    age = 0.1 * np.exp(5) * observer.bank.start_recovery ** np.arange(2, len(y) - 301)[:, None]
+    np.testing.assert_allclose(runs[0], runs[1] / (1 + age**2), atol=1e-9 * np.abs(runs[1]).max())
 
 
 def test_candidates_are_compared_without_groups_in_which_a_state_rests():

@@ -82,42 +82,28 @@ def with_gaps(
 ) -> FilterBank:
     """Return a filter bank with the ages of gaps that minimise a trial's errors under simulated losses.
 
-    The trial does not know the recordings. Ages of measured states change what the filters see: some are tried side by
-    side, with the best of the others for each.
+    The trial does not know the recordings. Those of measured states do not change: their substitutes are near the
+    fallback always.
     """
-    n, at = len(trial.recorded), list(trial.measured)
-    states, y, inputs, own = training(trial, recordings, settings)
-    batch = states.shape[1]
-    hidden = [i for i in range(n) if i not in at]
-    judged = hidden or at
-    missing = losses(np.random.default_rng(settings.seed), *y.shape[:2])
-    longest = settings.blocks(recordings.length)[-1]
-    halves, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
-    tried = halves[::2]
-    ages = np.full((len(tried), batch, n), _NEVER)
-    ages[..., at] = tried[:, None, None]
+    n = len(trial.recorded)
+    hidden = [i for i in range(n) if i not in trial.measured]
+    half, recovery = np.full(n, _NEVER), np.zeros(n)
     assert trial.bank is not None
-    side = replace(trial.bank, half=ages.reshape(-1, n), recovery=np.zeros(n))
-    shown, u = (np.tile(s, (1, len(tried), 1)) for s in (np.where(missing[..., None], np.nan, y), inputs))
-    several = {name: np.tile(values, len(tried)) for name, values in own.items()}
-    filtered, from_inputs = np.split(recorded_estimates(replace(trial, bank=side), shown, u, several), 2, axis=-1)
-    T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(halves, recoveries))
-    truth, lost = np.tile(states, (1, len(tried), 1)), np.tile(missing, (1, len(tried)))
-    others = [i for i in at if i not in judged]
-    by_state = np.log(np.mean((filtered - truth)[..., others] ** 2 * lost[..., None], axis=0) + TINY)
-    filtered[..., others] = truth[..., others]
-    every = blended_errors(truth, filtered, from_inputs, lost, F, judged, T, mu)
-    found = list[tuple[float, FilterBank]]()
-    for age, errors, known in zip(
-        tried, *(np.split(part, len(tried), axis=-2) for part in (every, by_state)), strict=True
-    ):
+    bank = replace(bank, half=half, recovery=recovery)
+    if hidden:
+        states, y, inputs, own = training(trial, recordings, settings)
+        lost = losses(np.random.default_rng(settings.seed), *y.shape[:2])
+        side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
+        shown = np.where(lost[..., None], np.nan, y)
+        filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
+        longest = settings.blocks(recordings.length)[-1]
+        ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
+        T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
+        filtered[..., list(trial.measured)] = states[..., list(trial.measured)]
+        errors = blended_errors(states, filtered, from_inputs, lost, F, hidden, T, mu)
         choice = errors.mean(axis=1).argmin(axis=0)
-        half, recovery = np.full(n, age), np.zeros(n)
-        if hidden:
-            half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
-        score = np.mean([*errors[choice, :, range(len(judged))], *known.T])
-        found.append((float(score), replace(bank, half=half, recovery=recovery)))
-    return min(found, key=lambda one: one[0])[1]
+        half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
+    return bank
 
 
 def decay_of(observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]) -> Array:

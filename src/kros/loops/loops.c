@@ -61,6 +61,7 @@ typedef struct {
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
     double *past;             /* (observers, batch, earlier), moved on */
     const double *reach;      /* (recorded) */
+    const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
     const double *bank;       /* (4, recorded, batch): half, recovery, longest age, recovery of a start */
     double *gap;              /* (recorded + q + 1 + q filters, batch): age, count, age of the start or the last loss, ramps; moved on */
     double *states;           /* (samples, observers, n, batch): x before every sample; none */
@@ -302,7 +303,9 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
             const vec recovered = either(some, old, bank[recorded * MOST + at] * either(old > oldest, oldest, old));
             int hidden = 1;
             for (whole j = 0; j < q; j++) hidden &= s->measured[j] != i;
+            const vec low = (vec){0} + s->limits[i], high = (vec){0} + s->limits[recorded + i];
             next[at] += begun * (next[(n - 3 * recorded) * MOST + at] - next[at]);
+            next[at] = either(next[at] < low, low, either(next[at] > high, high, next[at]));
             gap[at] = either(longest > recovered, longest, recovered);
             if (hidden) next[at] += level(gap[at], half) * (next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at] - next[at]);
         }

@@ -19,7 +19,8 @@ one percent after five time constants of :math:`\mu`. The estimate of a state th
 
 After a start, what happened before is not known; after a loss, filters hold what stood for measurements. There
 :math:`x + m (x^s - x)` takes the place of x, with an age that falls from :math:`0.1 e^5 T` on as the slowest filter
-forgets, and T = 1.
+forgets, and T = 1. Limits of the estimates hold before the fallback enters them, so that little of what is far away
+is left in long gaps.
 
 A missing measurement is replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback, and o of
 states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so
@@ -67,8 +68,9 @@ def longest_age(half: Array) -> Array:
 class Gaps:
     """State of the gaps of filter banks over a batch of machines."""
 
-    def __init__(self, bank: FilterBank, A: Array, measured: Columns, recorded: int, batch: int) -> None:
-        n, q = len(A), len(measured)
+    def __init__(self, bank: FilterBank, A: Array, measured: Columns, limits: tuple[Array, Array], batch: int) -> None:
+        n, q, recorded = len(A), len(measured), len(limits[0])
+        self.limits = limits
         self.bank, self.measured, self.recorded = bank, list(measured), recorded
         self.filters = slice(recorded, recorded + bank.filters)
         self.after_start, self.from_inputs, self.offset = (
@@ -118,6 +120,7 @@ class Gaps:
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
         disturbed = np.where(some[:, None], longest_age(np.ones(1)), self.start)
         recorded += disturbed**2 / (1 + disturbed**2) * (following[:, self.after_start] - recorded)
+        np.clip(recorded, *self.limits, out=recorded)
         recorded += self.hidden * bank.level(age) * (fallback - recorded)
         if some.any() or self.count.any():
             ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
@@ -133,6 +136,7 @@ class Gaps:
             "recorded": self.recorded,
             "filters": bank.filters,
             "reach": bank.reach,
+            "limits": np.array(self.limits),
             "bank": np.stack([np.broadcast_to(row, self.age.shape).T for row in rows]),
             "gap": self.state.copy(),
         }

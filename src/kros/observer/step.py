@@ -26,7 +26,8 @@ class Steps:
         self.waiting = np.zeros(batch, dtype=bool)  # for a start: the next step would leave the bounds
         self.gaps: Gaps | None = None
         if observer.bank is not None:
-            self.gaps = Gaps(observer.bank, observer.A[:n, :n], observer.measured, len(observer.recorded), batch)
+            limits = observer.runtime.sides(len(observer.recorded))
+            self.gaps = Gaps(observer.bank, observer.A[:n, :n], observer.measured, limits, batch)
 
     def begin(self, y: Array, machines: Flags | None = None, u: Array | None = None) -> None:
         """Start machines at measurements, (batch, q), and inputs where these are known, (batch, m)."""

@@ -103,11 +103,11 @@ def identify_estimator(
     trial = observer_of(*filters_of(readout.without(group), blind.without(group)))
 
     F = decay_of(observer, recordings, settings, held)
-    observer, trial = let_go(observer, F), let_go(trial, F)
+    observer, trial = (replace(let_go(one, F), runtime=bounded(one, recordings, settings)) for one in (observer, trial))
     assert observer.bank is not None
     assert trial.bank is not None
     bank = with_gaps(observer.bank, trial, F, unseen, settings)
-    observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings))
+    observer = replace(observer, bank=bank)
     states = lifting.states
 
     def by_state(values: Array) -> dict[str, float]:

@@ -134,7 +134,7 @@ def blended_errors(
     half: Array,
     recovery: Array,
 ) -> Array:
-    """Return log squared errors (c, batch, judged) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
+    """Return mean squared errors (c, batch, judged) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
     count, age, fading = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1])), np.zeros(len(F), bool)
     fading[judged] = True
     x, level, squares = (
@@ -151,4 +151,4 @@ def blended_errors(
         level = (age**2 / (age**2 + half**2))[..., None]
         x = filtered[k + 1] + fading * level * (from_inputs[k + 1] + offset - filtered[k + 1])
         squares = squares + (x - states[k + 1]) ** 2
-    return np.log(squares[..., judged] / len(missing) + TINY)
+    return squares[..., judged] / len(missing)

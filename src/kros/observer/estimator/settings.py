@@ -85,8 +85,7 @@ class EstimatorSettings(Settings):
     halves: tuple[float, ...] = Field(
         (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
         min_length=1,
-        description="ages of a gap at which the fallback counts one half, in longest delays; training chooses, "
-        "among every other one for measured states",
+        description="ages of a gap at which the fallback counts one half, in longest delays; training chooses",
     )
     recoveries: tuple[float, ...] = Field(
         (0.3, 3.0, 30.0),

@@ -102,13 +102,25 @@ def assemble(
     episodes = tuple(sorted(recordings.places, key=lambda key: [(natural_key(name), name) for name in astuple(key)]))
     facts = {unit.id: unit for unit in units}
     known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
+    reference = episodes[0]
     if sample_period_s is None:
-        sample_period_s = estimate_period(next(recordings.blocks(episodes[0], HEAD)))
+        sample_period_s, reference = _first_period(recordings, episodes)
     period = check_period(sample_period_s, "Population")
-    source = PreparedSource(recordings, channels, period, episodes[0])
+    source = PreparedSource(recordings, channels, period, reference)
     about: Record = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
     population = Population(sample_period_s=period, units=known, episodes=episodes, source=source, **about)
     return prepare(population, steps)
+
+
+def _first_period(recordings: Recordings, episodes: Sequence[EpisodeKey]) -> tuple[float, EpisodeKey]:
+    """Return the sampling period of the first episode whose beginning can be read, and this episode."""
+    problems = list[DataError]()
+    for key in episodes:
+        try:
+            return estimate_period(next(recordings.blocks(key, HEAD))), key
+        except DataError as error:
+            problems.append(error)
+    raise problems[0]
 
 
 def with_gaps(population: Population) -> Population:

@@ -51,12 +51,13 @@ class Discovery:
     population: Population  # as the mapping reads it, before preparation
     notes: dict[str, str] = field(default_factory=dict)  # what a key of the mapping rests on
     findings: Names = ()  # what looks wrong
-    drop_nan: bool = False  # whether episodes with NaN or infinity have to be dropped
     reading: str = ""  # what the first file was taken for
 
 
-def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None) -> Discovery:
-    """Describe a folder of tables."""
+def discover(
+    source: Path, wanted: Wanted | None = None, work: Work | None = None, fewest: int = CHECK.samples
+) -> Discovery:
+    """Describe a folder of tables; an episode needs at least the `fewest` samples."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
     names = infer_names(list(alike))
@@ -70,10 +71,14 @@ def discover(source: Path, wanted: Wanted | None = None, work: Work | None = Non
     columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
     columns = _decided(columns, wanted)
     mapping |= {**keys, "channel": [_channel(c) for c in columns if c.part in _RECORDED]}
-    population = read_csv_folder(source, mapping | _exclusion(strange))
+    damaged = dict[str, str]()
+    population = read_csv_folder(source, mapping | _exclusion(list(strange)), damaged=damaged)
     draft = Discovery(mapping, (), tuple(columns), population, notes)
-    findings = [f"{len(strange)} files are not like the others and left alone: {some(strange)}"] if strange else []
-    return _examined(source, draft, findings, [name for name in strange if re.search(mapping["files"], name)], work)
+    alone = f"{len(strange)} files are not like the others and left alone: {some(list(strange))}"
+    findings = [f"{alone}; the first {next(iter(strange.values()))}"] if strange else []
+    findings += [f"left out, {name}: {why}" for name, why in damaged.items()]
+    unused = [name for name in (*strange, *damaged) if re.search(mapping["files"], name)]
+    return _examined(source, draft, findings, unused, fewest, work)
 
 
 def _files(source: Path, expression: str | None) -> dict[str, Path]:
@@ -92,8 +97,8 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     return selected
 
 
-def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str]]:
-    """Return how most files are written, those files, and the others."""
+def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], dict[str, str]]:
+    """Return how most files are written, those files, and what is different in the others."""
     paths, heads = list(files.values()), []
     for path in paths[:: max(1, len(paths) // RULE.looked_at)]:
         with suppress(DataError):
@@ -104,18 +109,19 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
     usual = (h for h in heads if (h.dialect, h.fields) == commonest)
     head = max(usual, key=lambda h: sum(map(h.is_numeric, range(len(h.fields)))))  # a sensor may have been off
-    alike = {relative: path for relative, path in files.items() if _fits(path, head)}
-    return head, alike, [relative for relative in files if relative not in alike]
+    strange = {relative: why for relative, path in files.items() if (why := _difference(path, head))}
+    return head, {relative: path for relative, path in files.items() if relative not in strange}, strange
 
 
-def _fits(path: Path, head: TableHead) -> bool:
-    """Tell whether a file has the columns of the others, where they have them."""
+def _difference(path: Path, head: TableHead) -> str:
+    """Return what a file has in place of the columns of the others, where they have them, or nothing."""
     try:
         fields, _ = file_fields(path, head.dialect, head.fields)
-    except DataError:
-        return False
+    except DataError as error:
+        return f"cannot be read ({error})"
     names, needed = ({split_header(name)[0] for name in of} for of in (fields, head.fields))
-    return needed - {""} <= names if head.dialect.header else len(fields) == len(head.fields)
+    fits = needed - {""} <= names if head.dialect.header else len(fields) == len(head.fields)
+    return "" if fits else f"has the columns {', '.join(fields)}"
 
 
 def _columns(
@@ -124,21 +130,12 @@ def _columns(
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
     described = _described(head)
     numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields[i]]
-    samples = []
-    for path in paths[:: max(1, len(paths) // RULE.sampled)]:
-        with suppress(DataError):
-            samples.append(_read(path, head, numeric))
+    path, samples = _sampled(source, paths, head, numeric)
     labels = dict[str, str]()
     if not period_s and not time_columns([described[i] for i in numeric], samples):
-        labels = label_columns(paths[0], head)  # of several episodes in a file
+        labels = label_columns(path, head)  # of several episodes in a file
     if labels:
-        whole = _read(paths[0], head, numeric)
-        samples = [whole[:, rows] for rows in stretches(paths[0], head, labels.values())[: RULE.sampled]]
-    samples = [s for s in samples if s.shape[1] > 2]
-    if not samples:
-        _read(paths[0], head, numeric)  # says why not, where it cannot be read
-        problem = "the files looked at have fewer than three rows of numbers"
-        raise DataError(f"Looking at {source}: {problem}; check the folder.")
+        samples = [samples[0][:, rows] for rows in stretches(path, head, labels.values())[: RULE.sampled]]
     time, keys, notes = None, Record(sample_period_s=period_s), dict[str, str]()
     if not period_s:
         time, keys, notes = _time(source, head, described, numeric, samples)
@@ -150,6 +147,25 @@ def _columns(
         if column.header in labels.values():
             described[i] = replace(column, why="says which unit, condition or episode a row belongs to")
     return [c for c, name in zip(described, head.fields, strict=True) if name], keys, notes
+
+
+def _sampled(source: Path, paths: Sequence[Path], head: TableHead, columns: Sequence[int]) -> tuple[Path, list[Array]]:
+    """Return the numbers of some files, spread over those that can be read, and the first of these files."""
+    spread = paths[:: max(1, len(paths) // RULE.sampled)]
+    samples, problem = dict[Path, Array](), "the files have fewer than three rows of numbers; check the folder."
+    for path in dict.fromkeys((*spread, *paths)):
+        try:
+            values = _read(path, head, columns)
+        except DataError as error:
+            problem = str(error)
+            continue
+        if values.shape[1] >= CHECK.samples:
+            samples[path] = values
+        if len(samples) == len(spread):
+            break
+    if not samples:
+        raise DataError(f"Looking at {source}: {problem}")
+    return next(iter(samples)), list(samples.values())
 
 
 def _described(head: TableHead) -> list[TableColumn]:
@@ -173,6 +189,7 @@ def _time(
         at = numeric[candidates[0]]
         scale, why = time_scale(columns[at], float(np.median(np.diff(samples[0][candidates[0]]))))
         keys: Record = {"time": columns[at].reference}
+        keys |= {"time_unit": columns[at].recorded} if columns[at].recorded else {}
         return (at, keys, {}) if scale == 1 else (at, keys | {"time_scale": scale}, {"time_scale": why})
     if texts:
         return texts[-1], {"time": columns[texts[-1]].reference, "timestamp": head.timestamp(texts[-1])}, {}
@@ -230,25 +247,26 @@ def _place(columns: Sequence[TableColumn], name: str) -> int:
 
 
 def _examined(
-    source: Path, draft: Discovery, findings: list[str], excluded: Sequence[str], work: Work | None
+    source: Path, draft: Discovery, findings: list[str], excluded: Sequence[str], fewest: int, work: Work | None
 ) -> Discovery:
     """Look at every episode, leave out what cannot be used, and complete the description."""
     population, mapping, notes = draft.population, draft.mapping, dict(draft.notes)
-    looks = examine(population, work or Work())
+    looks = examine(population, fewest, work or Work())
     wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
-    nan = [s for s in good if s.nan]
-    bridged = len(nan) if min((s.n_samples for s in nan), default=0) >= RULE.shortest_piece else 0
-    counts = Counter((s.key.unit, s.key.condition) for s in good if bridged or not s.nan)
+    counts = Counter((s.key.unit, s.key.condition) for s in good)
     if not counts:
-        why = f"{looks[0].key}: {looks[0].wrong or looks[0].nan}"
-        raise DataError(f"Looking at {source}: none of {len(looks)} episodes can be used; {why}.")
+        raise DataError(
+            f"Looking at {source}: none of {len(looks)} episodes can be used; {looks[0].key}: {looks[0].wrong}"
+        )
     findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]
-    findings += [s.nan for s in nan if not bridged]
-    few = [group for group, n in counts.items() if n < 2]
-    if 2 * len(few) > len(counts) and min(s.n_samples for s in good) >= RULE.pieces * RULE.shortest_piece:
-        mapping = mapping | {"pieces": RULE.pieces}
+    few, shortest = [group for group, n in counts.items() if n < 2], min(s.n_samples for s in good)
+    if 2 * len(few) > len(counts) and shortest >= 2 * fewest:
+        mapping = mapping | {"pieces": int(np.clip(shortest // RULE.shortest_piece, 2, RULE.pieces))}
         notes["pieces"] = "there is one recording for most units and conditions: each is cut into so many episodes"
         few = []
+    if len(few) == len(counts):
+        needs = f"two are needed, of {fewest} samples each; record more, or name files (--files)"
+        raise DataError(f"Looking at {source}: every unit has one episode that can be used, and {needs}.")
     for unit, condition in few:
         wrong |= dict.fromkeys(population.keys(unit, condition), "the only episode of its unit and condition")
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
@@ -257,22 +275,24 @@ def _examined(
     unusable = [part_of(path, key) if path in usable_files else path for key, path in paths.items()]
     mapping = mapping | _exclusion([*excluded, *unusable])
     retained = read_csv_folder(source, mapping)
-    prepare, text = _resampling(population, source, good, bridged)
+    prepare, text = _resampling(population, source, good)
     reading = _reading(retained, source)
-    return Discovery(mapping, prepare, draft.columns, retained, notes, (*findings, *text), len(nan) > bridged, reading)
+    return Discovery(mapping, prepare, draft.columns, retained, notes, (*findings, *text), reading)
 
 
 def _resampling(
-    population: Population, source: Path, looks: Sequence[EpisodeLook], bridged: int
+    population: Population, source: Path, looks: Sequence[EpisodeLook]
 ) -> tuple[tuple[Record, ...], list[str]]:
     """Return the step that makes time even or bridges NaN, and a sentence about it; nothing where neither is needed."""
     median, worst = float(np.median([s.period_s for s in looks])), max(looks, key=lambda s: s.uneven)
     period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
     even = not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks)
+    bridged = sum(s.nan for s in looks)
     if even and not bridged:
         return (), []
-    recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
-    text = f"NaN in {bridged} episodes is bridged by straight lines" if even else "time is uneven"
+    recorded = f"(recorded at {min(s.period_s for s in looks):.4g} to {max(s.period_s for s in looks):.4g} s)"
+    text = "time is uneven" if uneven else "sampling periods differ"
+    text = f"NaN in {bridged} episodes is bridged by straight lines" if even else text
     text += f": all episodes are resampled to a period of {period_s:g} s {recorded}"
     if uneven:
         where = f"at sample {worst.uneven[1]} of {_relative(population, source, worst.key)}"

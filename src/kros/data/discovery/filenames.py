@@ -19,7 +19,7 @@ _WORDS = {
     UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder "
     "pump valve design joint sample specimen antrieb maschine geraet gerät pruefling prüfling einheit anlage moteur "
     "variateur part id",
-    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung "
+    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung day session "
     "versuch lauf aufnahme essai mesure meas nr no",
     CONDITION: "condition cond load config mode case temp last bedingung zustand charge",
 }
@@ -57,7 +57,7 @@ def infer_names(paths: Sequence[str]) -> FileNames:
         if cut is None:
             continue
         columns = list(zip(*(p[::2] for p in cut), strict=True))
-        roles, sure = _roles(columns)
+        roles, sure = _roles(columns, max((i for i, mark in enumerate(cut[0][1::2], 1) if "/" in mark), default=0))
         pattern = _pattern(cut, roles, ending)
         if _tells_apart(pattern, paths):
             alone = not sure and roles.count(UNIT) == 1 and not {EPISODE, GROUP} & set(roles)
@@ -95,8 +95,8 @@ def _aligned(stems: Sequence[str]) -> Cut | None:
     return [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts] if tail > 0 else None
 
 
-def _roles(columns: list[Names]) -> tuple[Roles, bool]:
-    """Tell what every word is: text, or one of the groups; and whether words said so."""
+def _roles(columns: list[Names], folders: int) -> tuple[Roles, bool]:
+    """Tell what every word is, the first ones of `folders`: text, or one of the groups; and whether words said so."""
     varying = [i for i, c in enumerate(columns) if len(set(c)) > 1]
     roles: Roles = [_by_words(columns, i) if i in varying else None for i in range(len(columns))]
     for i in range(len(columns) - 2):
@@ -117,7 +117,7 @@ def _roles(columns: list[Names]) -> tuple[Roles, bool]:
             roles[i] = GROUP
     left = [i for i in left if roles[i] is None]
     if left:
-        _by_place(columns, varying, left, roles)
+        _by_place(columns, folders, varying, left, roles)
     return _contiguous(roles), not left
 
 
@@ -144,16 +144,18 @@ def _by_words(columns: list[Names], i: int) -> str | None:
     return role or (EPISODE if all(_DATE.match(v) for v in columns[i]) else None)
 
 
-def _by_place(columns: list[Names], varying: Sequence[int], left: Sequence[int], roles: Roles) -> None:
+def _by_place(columns: list[Names], folders: int, varying: Sequence[int], left: Sequence[int], roles: Roles) -> None:
     """Set the roles that no word tells: units before conditions before episodes."""
     if UNIT not in roles:  # what differs in every file is no machine, unless nothing else differs
         repeated = [i for i in left if len(set(columns[i])) < len(columns[i]) or varying == [i]]
-        for i in repeated[:1]:
+        numbered = [i for i in repeated if i < folders and all(re.search(r"\d", v) for v in columns[i])]
+        above = [i for i in numbered if EPISODE in roles[i:]]  # hall1/crane1/run1: the folder of a set of runs
+        for i in (above or repeated[:1])[-1:]:
             roles[i] = UNIT
-    for i in left:
-        numbered = [bool(re.search(r"\d", v)) for v in columns[i]]
+    for i in reversed(left):
+        numbers = [bool(re.search(r"\d", v)) for v in columns[i]]
         before = UNIT in roles[i + 1 :] and not any(roles[i + 1 : roles.index(UNIT, i + 1)])
-        if roles[i] is None and before and all(numbered):  # batch2/motor7: the batch is part of the name
+        if roles[i] is None and before and all(numbers):  # batch2/motor7: the batch is part of the name
             roles[i] = UNIT
         elif roles[i] is None:
             labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1

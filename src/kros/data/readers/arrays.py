@@ -107,13 +107,15 @@ def from_arrays(
 
 
 def as_numbers(values: Any) -> Array:
-    """Return an array of doubles; text, complex numbers and dates are refused rather than converted."""
-    array = np.asarray(values)
+    """Return an array of doubles, NaN for what is masked; text, complex numbers and dates are refused."""
+    parts = values if isinstance(values, list | tuple) else [values]
+    masked = any(isinstance(part, np.ma.MaskedArray) for part in parts)
+    array = np.ma.asarray(values) if masked else np.asarray(values)
     kind = array.dtype.kind
     mixed = kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in array.ravel().tolist())
     if mixed or kind not in "biufO":
         raise TypeError(f"{'text or complex' if mixed else array.dtype} cannot be used as real numbers")
-    return np.asarray(array, dtype=float)
+    return np.ma.filled(array.astype(float, copy=False), np.nan)
 
 
 def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:

@@ -71,6 +71,7 @@ class CsvMapping(Settings):
     )
     channel: tuple[ChannelMapping, ...] = Field(description="the channels, in any order")
     time: Column | None = Field(None, description="column of time")
+    time_unit: str = Field("", description="of the column of time, as `column_unit` of a channel")
     unit: tuple[UnitMapping, ...] = Field((), description="where one file holds several units")
     time_scale: float = Field(1.0, gt=0, description="factor from the column of time to seconds")
     sample_period_s: float | None = Field(None, gt=0, description="in place of a column of time")
@@ -282,19 +283,33 @@ class CsvRecordings(Recordings):
 
 
 def read_csv_folder(
-    source: Path | str, mapping: CsvMapping | ByName | Path | str, optional: Collection[str] = ()
+    source: Path | str,
+    mapping: CsvMapping | ByName | Path | str,
+    optional: Collection[str] = (),
+    damaged: dict[str, str] | None = None,
 ) -> Population:
-    """Read a folder of CSV files, also gzip-compressed."""
+    """Read a folder of CSV files, also gzip-compressed; `damaged` collects files that cannot be used, with the reason.
+
+    Without `damaged`, the first of these files is an error.
+    """
     chosen, source = load_mapping(mapping), Path(source)
     places = dict[EpisodeKey, FilePlace]()
-    groups = dict[str, str]()
+    groups, units_of_measure = dict[str, str](), dict[Column, str]()
     for path, match in _matches(source, chosen):
-        fields, stated = file_fields(path, chosen.dialect, chosen.declared)
-        if optional and not places:
-            chosen = chosen.without(_absent(chosen, fields, optional))
+        relative = path.relative_to(source).as_posix()
         named = {name: text for name, text in match.groupdict().items() if text}
-        for key, place in _episodes(path, fields, stated, named, chosen):
-            part = part_of(path.relative_to(source).as_posix(), key)
+        try:
+            fields, stated = file_fields(path, chosen.dialect, chosen.declared)
+            if optional and not places:
+                chosen = chosen.without(_absent(chosen, fields, optional))
+            episodes = list(_episodes(path, fields, stated, named, chosen, units_of_measure))
+        except DataError as error:
+            if damaged is None:
+                raise
+            damaged[relative] = str(error)
+            continue
+        for key, place in episodes:
+            part = part_of(relative, key)
             if place.rows is not None and chosen.exclude and re.search(chosen.exclude, part):
                 continue
             if key in places:
@@ -323,10 +338,15 @@ def part_of(path: str, key: EpisodeKey) -> str:
 
 
 def _episodes(
-    path: Path, fields: list[str], stated: list[str], named: dict[str, str], mapping: CsvMapping
+    path: Path,
+    fields: list[str],
+    stated: list[str],
+    named: dict[str, str],
+    mapping: CsvMapping,
+    known: dict[Column, str],
 ) -> Iterator[tuple[EpisodeKey, FilePlace]]:
-    """Yield the episodes of a file, of which its name says some parts."""
-    places = [(unit.suffix, _place(path, fields, stated, mapping, unit)) for unit in mapping.units]
+    """Yield the episodes of a file, of which its name says some parts; `known` are units of measure of other files."""
+    places = [(unit.suffix, _place(path, fields, stated, mapping, unit, known)) for unit in mapping.units]
     for labels, number, rows in _stretches(path, fields, mapping):
         parts = {"unit": "unit", "condition": DEFAULT_CONDITION, "episode": "0", **named, **labels}
         for suffix, place in places:
@@ -394,29 +414,36 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         log.warning(text, len(others), source, mapping.files, some(others))
 
 
-def _place(path: Path, fields: list[str], stated: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
+def _place(
+    path: Path, fields: list[str], stated: list[str], mapping: CsvMapping, unit: UnitMapping, known: dict[Column, str]
+) -> FilePlace:
     """Return where the channels of a unit are in a file."""
-    wanted = [] if mapping.time is None else [(mapping.time, "")]
+    wanted = [] if mapping.time is None else [(mapping.time, mapping.time_unit)]
     wanted += [(mapping.column(channel, unit), channel.column_unit) for channel in mapping.ordered]
     numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for (c, _), f in zip(wanted, fields, strict=False))
     if mapping.header and numbered:
         problem = f"one header line is needed, found numbers in the first line: {fields}"
         raise DataError(f"Reading {path}: {problem}; put the names of the columns first, or set header = false.")
     at = tuple(_position(path, fields, *column) for column in wanted)
-    conversion = tuple(_conversion(path, *column, stated[i]) for column, i in zip(wanted, at, strict=True))
+    conversion = tuple(_conversion(path, *column, stated[i], known) for column, i in zip(wanted, at, strict=True))
     changed = any(pair != (1.0, 0.0) for pair in conversion)
     return FilePlace(str(path), tuple(fields), at, conversion if changed else ())
 
 
-def _conversion(path: Path, column: Column, declared: str, stated: str) -> tuple[float, float]:
+def _conversion(
+    path: Path, column: Column, declared: str, stated: str, known: dict[Column, str]
+) -> tuple[float, float]:
     """Return factor and offset from the unit that a file states of a column to the one that is declared."""
     declared = declared or (split_header(column)[1] if isinstance(column, str) else "")
-    if not declared or not stated or clean_unit(declared) == stated:
+    usual = declared or (known.setdefault(column, stated) if stated else "")
+    if not stated or clean_unit(usual) == stated:
         return 1.0, 0.0
-    ours, theirs = measure(declared), measure(stated)
-    if ours is None or theirs is None or ours.si != theirs.si:
-        problem = f"column {column!r} is in {stated!r}, and declared in {declared!r}"
-        raise DataError(f"Reading {path}: {problem}; correct the file, or column_unit.")
+    ours, theirs = measure(usual), measure(stated)
+    if ours is None or theirs is None or ours.si != theirs.si or not (declared or ours == theirs):
+        problem = (
+            f"column {column!r} is in {stated!r}, and {'declared' if declared else 'in another file'} in {usual!r}"
+        )
+        raise DataError(f"Reading {path}: {problem}; correct the file, or column_unit (time_unit).")
     return theirs.factor / ours.factor, (theirs.offset - ours.offset) / ours.factor
 
 

@@ -79,7 +79,7 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     root, what = find_root(Path(source)), f"Reading {source} as motor-drive-raw"
     if root is None:
         missing = "found no folder 'population' or 'outliers', nor 'batch_b' with one of them"
-        raise DataError(f"{what}: {missing}; check the path.")
+        raise DataError(f"{what}: {missing}; check the path, or set another data.reader.")
     files = [name for _, name in csv_files(root) if name.endswith(".csv") and name.startswith(GROUPS)]
     strange = next((name for name in files if not re.search(MAPPING.files, name)), None)
     if strange is not None:

@@ -17,9 +17,9 @@ import numpy as np
 
 from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_mean, frozen
 from ..measures import split_header
-from ..population import EpisodeKey, Population
+from ..population import EpisodeKey, Population, Role
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, part_of, read_csv_folder
-from ..readers.tables import Dialect, file_fields, read_blocks
+from ..readers.tables import Table
 from ..recording import CHECK, some, usable
 from ..steps import GAP
 from .dialect import TableHead, look_at
@@ -67,7 +67,7 @@ def discover(
             f"choose, --files '{names.other}' or --files '{names.pattern}'."
         )
     mapping: Record = {"files": wanted.files or names.pattern}
-    mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
+    mapping |= head.dialect.model_dump(exclude_defaults=True)
     columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
     columns = _decided(columns, wanted)
     mapping |= {**keys, "channel": [_channel(c) for c in columns if c.part in _RECORDED]}
@@ -97,7 +97,7 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     return selected
 
 
-def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], dict[str, str]]:
+def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], dict[str, str]]:
     """Return how most files are written, those files, and what is different in the others."""
     paths, heads = list(files.values()), []
     for path in paths[:: max(1, len(paths) // RULE.looked_at)]:
@@ -109,33 +109,33 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], dict[str
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
     usual = (h for h in heads if (h.dialect, h.fields) == commonest)
     head = max(usual, key=lambda h: sum(map(h.is_numeric, range(len(h.fields)))))  # a sensor may have been off
-    strange = {relative: why for relative, path in files.items() if (why := _difference(path, head))}
-    return head, {relative: path for relative, path in files.items() if relative not in strange}, strange
-
-
-def _difference(path: Path, head: TableHead) -> str:
-    """Return what a file has in place of the columns of the others, where they have them, or nothing."""
-    try:
-        fields, _ = file_fields(path, head.dialect, head.fields)
-    except DataError as error:
-        return f"cannot be read ({error})"
-    names, needed = ({split_header(name)[0] for name in of} for of in (fields, head.fields))
-    fits = needed - {""} <= names if head.dialect.header else len(fields) == len(head.fields)
-    return "" if fits else f"has the columns {', '.join(fields)}"
+    alike, strange = dict[str, Table](), dict[str, str]()
+    for relative, path in files.items():
+        try:
+            table = Table.open(path, head.dialect, head.fields)
+        except DataError as error:
+            strange[relative] = f"cannot be read ({error})"
+            continue
+        names, needed = ({split_header(name)[0] for name in of} for of in (table.fields, head.fields))
+        if needed - {""} <= names if head.dialect.header else len(table.fields) == len(head.fields):
+            alike[relative] = table
+        else:
+            strange[relative] = f"has the columns {', '.join(table.fields)}"
+    return head, alike, strange
 
 
 def _columns(
-    source: Path, head: TableHead, paths: Sequence[Path], period_s: float | None
+    source: Path, head: TableHead, tables: Sequence[Table], period_s: float | None
 ) -> tuple[list[TableColumn], Record, dict[str, str]]:
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
     described = _described(head)
     numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields[i]]
-    path, samples = _sampled(source, paths, head, numeric)
+    table, samples = _sampled(source, [table for table in tables if table.fields == head.fields], numeric)
     labels = dict[str, str]()
     if not period_s and not time_columns([described[i] for i in numeric], samples):
-        labels = label_columns(path, head)  # of several episodes in a file
+        labels = label_columns(table)  # of several episodes in a file
     if labels:
-        samples = [samples[0][:, rows] for rows in stretches(path, head, labels.values())[: RULE.sampled]]
+        samples = [samples[0][:, rows] for rows in stretches(table, labels.values())[: RULE.sampled]]
     time, keys, notes = None, Record(sample_period_s=period_s), dict[str, str]()
     if not period_s:
         time, keys, notes = _time(source, head, described, numeric, samples)
@@ -149,18 +149,21 @@ def _columns(
     return [c for c, name in zip(described, head.fields, strict=True) if name], keys, notes
 
 
-def _sampled(source: Path, paths: Sequence[Path], head: TableHead, columns: Sequence[int]) -> tuple[Path, list[Array]]:
-    """Return the numbers of some files, spread over those that can be read, and the first of these files."""
-    spread = paths[:: max(1, len(paths) // RULE.sampled)]
-    samples, problem = dict[Path, Array](), "the files have fewer than three rows of numbers; check the folder."
-    for path in dict.fromkeys((*spread, *paths)):
+def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[int]) -> tuple[Table, list[Array]]:
+    """Return columns of some tables, (n_columns, n_rows), spread over those that can be read, and the first of these.
+
+    What cannot be used is NaN.
+    """
+    spread = tables[:: max(1, len(tables) // RULE.sampled)]
+    samples, problem = dict[Table, Array](), "the files have fewer than three rows of numbers; check the folder."
+    for table in dict.fromkeys((*spread, *tables)):
         try:
-            values = _read(path, head, columns)
+            (values,) = table.numbers(columns)
         except DataError as error:
             problem = str(error)
             continue
-        if values.shape[1] >= CHECK.samples:
-            samples[path] = values
+        if len(values) >= CHECK.samples:
+            samples[table] = np.where(usable(values), values, np.nan).T
         if len(samples) == len(spread):
             break
     if not samples:
@@ -199,19 +202,13 @@ def _time(
     raise DataError(f"Looking at {source}: {problem}, found the columns {found}; give --period SECONDS.")
 
 
-def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
-    """Read the numeric columns of a file, shape (n_columns, n_rows), NaN where a number cannot be used."""
-    (values,) = read_blocks(path, head.fields, columns, head.dialect)
-    return np.where(usable(values), values, np.nan).T
-
-
 def _channel(column: TableColumn) -> Record:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
     role, measured = "input" if column.part is ColumnPart.INPUT else "state", column.part is ColumnPart.MEASURED
-    table: Record = {"name": column.name, "column": column.reference, "column_unit": column.recorded}
-    table |= {"role": role, "measured": measured, "unit": column.unit, "scale": column.scale, "offset": column.offset}
-    default = {name: f.default for name, f in ChannelMapping.model_fields.items()} | {"column": column.name}
-    return {key: value for key, value in table.items() if value != default[key]}
+    named = {} if column.reference == column.name else {"column": column.reference}
+    about = {"unit": column.unit, "column_unit": column.recorded, "scale": column.scale, "offset": column.offset}
+    channel = ChannelMapping(name=column.name, role=Role(role), measured=measured, **named, **about)
+    return channel.model_dump(mode="json", exclude_defaults=True)
 
 
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
@@ -315,4 +312,4 @@ def _exclusion(names: Sequence[str]) -> Record:
 
 def _relative(population: Population, source: Path, key: EpisodeKey) -> str:
     recordings: Any = population.source
-    return Path(recordings.recordings.places[key].path).relative_to(source).as_posix()
+    return Path(recordings.recordings.places[key].table.path).relative_to(source).as_posix()

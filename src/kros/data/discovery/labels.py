@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import accumulate, groupby
-from pathlib import Path
 
-from ..readers.tables import read_labels
-from .dialect import TableHead
+from ..readers.tables import Table
 from .roles import identifier
 
 _ROLES = {
@@ -18,20 +16,20 @@ _ROLES = {
 }
 
 
-def label_columns(path: Path, head: TableHead) -> dict[str, str]:
+def label_columns(table: Table) -> dict[str, str]:
     """Return the columns whose names and values, which change now and then in a file, say that they label rows."""
     labels = dict[str, str]()
-    for field in head.fields:
+    for field in table.fields:
         words = set(identifier(f"{field} ").lower().split("_"))
         role = next((role for role, known in _ROLES.items() if words <= set(known.split())), None)
-        rows = stretches(path, head, [field]) if role else []
+        rows = stretches(table, [field]) if role else []
         if role and 1 < len(rows) < rows[-1].stop / 10:
             labels.setdefault(role, field)
     return labels
 
 
-def stretches(path: Path, head: TableHead, labels: Iterable[str]) -> list[slice]:
+def stretches(table: Table, labels: Iterable[str]) -> list[slice]:
     """Return the rows of every episode in a file."""
-    columns = [read_labels(path, head.fields, head.fields.index(field), head.dialect) for field in labels]
+    columns = [table.texts(table.fields.index(field)) for field in labels]
     counts = [len(list(rows)) for _, rows in groupby(zip(*columns, strict=True))]
     return [slice(end - count, end) for end, count in zip(accumulate(counts), counts, strict=True)]

@@ -33,7 +33,7 @@ from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import STEPS, Scale, Step
 from .formats import FORMATS
-from .tables import TIMESTAMP_SCALE, Dialect, file_fields, read_blocks, read_labels
+from .tables import TIMESTAMP_SCALE, Dialect, Table
 
 Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
@@ -60,7 +60,7 @@ class UnitMapping(Settings):
     columns: dict[str, Column] = Field({}, description="column by channel, where it is not that of `[[channel]]`")
 
 
-class CsvMapping(Settings):
+class CsvMapping(Dialect):
     r"""How a folder of tables maps to a population; a file that does not match `files` is left alone."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -80,12 +80,6 @@ class CsvMapping(Settings):
         description="regular expression; paths in which it occurs are left out. Behind the path of a file with several "
         "episodes stands which one, such as log.csv#unit/condition/episode",
     )
-    delimiter: str = Field(",", description="between columns; a tab is written `\\t`")
-    header: bool = Field(True, description="false where the first line holds numbers; columns are then given by number")
-    skip_rows: int = Field(0, ge=0, description="lines before the header, or before the first line of numbers")
-    unit_rows: int = Field(0, ge=0, description="lines between the header and the numbers, such as units of measure")
-    decimal: str = Field(".", description="decimal point, for example `,` in files of some countries")
-    encoding: str = Field("utf-8", description="of the text, for example cp1252 or utf-16")
     timestamp: Literal["ymd", "dmy", "mdy"] | None = Field(
         None, description="where time is a timestamp: the order of its date; a time of day alone takes any of them"
     )
@@ -179,7 +173,7 @@ class CsvMapping(Settings):
     @property
     def dialect(self) -> Dialect:
         """How its files are written."""
-        return Dialect(self.delimiter, self.header, self.skip_rows, self.decimal, self.encoding, self.unit_rows)
+        return Dialect(**self.model_dump(include=set(Dialect.model_fields)))
 
     def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column:
         """Return where a channel of a unit is read from."""
@@ -223,10 +217,9 @@ _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class FilePlace:
-    """Where an episode is: a file, its columns, the positions of those wanted (time first), rows, and which piece."""
+    """Where an episode is: a table, the positions of its columns that are wanted (time first), rows, and which piece."""
 
-    path: str
-    fields: Names
+    table: Table
     wanted: Columns
     conversion: tuple[tuple[float, float], ...] = ()  # factor and offset of those wanted, where units differ
     rows: tuple[int, int] | None = None
@@ -237,13 +230,12 @@ class FilePlace:
 class CsvRecordings(Recordings):
     """Reads one file at a time; without `time_scale` there is no column of time."""
 
-    dialect: Dialect
     time_scale: float | None
     timestamp: str | None = None
 
     def file(self, place: FilePlace) -> Path:
         """Return the file of an episode."""
-        return Path(place.path)
+        return place.table.path
 
     def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
         """Return one episode as recorded."""
@@ -269,7 +261,7 @@ class CsvRecordings(Recordings):
     def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
         """Yield the columns of a file in blocks, in the units of measure that are declared."""
         factors, offsets = np.array(place.conversion or [(1.0, 0.0)]).T
-        blocks = read_blocks(Path(place.path), place.fields, place.wanted, self.dialect, self.timestamp, rows)
+        blocks = place.table.numbers(place.wanted, self.timestamp, rows)
         return (values * factors + offsets if place.conversion else values for values in blocks)
 
     def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
@@ -293,16 +285,16 @@ def read_csv_folder(
     Without `damaged`, the first of these files is an error.
     """
     chosen, source = load_mapping(mapping), Path(source)
-    places = dict[EpisodeKey, FilePlace]()
+    dialect, places = chosen.dialect, dict[EpisodeKey, FilePlace]()
     groups, units_of_measure = dict[str, str](), dict[Column, str]()
     for path, match in _matches(source, chosen):
         relative = path.relative_to(source).as_posix()
         named = {name: text for name, text in match.groupdict().items() if text}
         try:
-            fields, stated = file_fields(path, chosen.dialect, chosen.declared)
+            table = Table.open(path, dialect, chosen.declared)
             if optional and not places:
-                chosen = chosen.without(_absent(chosen, fields, optional))
-            episodes = list(_episodes(path, fields, stated, named, chosen, units_of_measure))
+                chosen = chosen.without(_absent(chosen, table.fields, optional))
+            episodes = list(_episodes(table, named, chosen, units_of_measure))
         except DataError as error:
             if damaged is None:
                 raise
@@ -313,7 +305,7 @@ def read_csv_folder(
             if place.rows is not None and chosen.exclude and re.search(chosen.exclude, part):
                 continue
             if key in places:
-                twice = f"{key} is in {places[key].path} and in {path}"
+                twice = f"{key} is in {places[key].table.path} and in {path}"
                 raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
             check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
             places[key], group = place, named.get("group", "")
@@ -326,7 +318,7 @@ def read_csv_folder(
         actual = f"no file matches files = {chosen.files!r}{sample or f'; there is no file that ends in {endings}'}"
         raise DataError(f"Reading {source} as csv: {actual}; correct the expression.")
     time_scale = None if chosen.time is None else chosen.time_scale
-    recordings = CsvRecordings(places, chosen.dialect, time_scale, chosen.timestamp)
+    recordings = CsvRecordings(places, time_scale, chosen.timestamp)
     units = [Unit(unit, group) for unit, group in groups.items()]
     facts = (chosen.channels, units, chosen.sample_period_s, chosen.metadata)
     return assemble(recordings, *facts, steps=chosen.steps, scaling=chosen.scaling)
@@ -338,16 +330,11 @@ def part_of(path: str, key: EpisodeKey) -> str:
 
 
 def _episodes(
-    path: Path,
-    fields: list[str],
-    stated: list[str],
-    named: dict[str, str],
-    mapping: CsvMapping,
-    known: dict[Column, str],
+    table: Table, named: dict[str, str], mapping: CsvMapping, known: dict[Column, str]
 ) -> Iterator[tuple[EpisodeKey, FilePlace]]:
     """Yield the episodes of a file, of which its name says some parts; `known` are units of measure of other files."""
-    places = [(unit.suffix, _place(path, fields, stated, mapping, unit, known)) for unit in mapping.units]
-    for labels, number, rows in _stretches(path, fields, mapping):
+    places = [(unit.suffix, _place(table, mapping, unit, known)) for unit in mapping.units]
+    for labels, number, rows in _stretches(table, mapping):
         parts = {"unit": "unit", "condition": DEFAULT_CONDITION, "episode": "0", **named, **labels}
         for suffix, place in places:
             for i in range(mapping.pieces):
@@ -356,17 +343,15 @@ def _episodes(
                 yield key, replace(place, rows=rows, piece=(i, mapping.pieces))
 
 
-def _stretches(
-    path: Path, fields: list[str], mapping: CsvMapping
-) -> Iterator[tuple[dict[str, str], str, tuple[int, int] | None]]:
+def _stretches(table: Table, mapping: CsvMapping) -> Iterator[tuple[dict[str, str], str, tuple[int, int] | None]]:
     """Yield what columns state of every episode in a file, its number and its rows; None where it is the whole file."""
     labels, trigger = mapping.labels, mapping.trigger
     if not labels and trigger is None:
         yield {}, "", None
         return
-    columns = [read_labels(path, fields, _position(path, fields, c), mapping.dialect) for c in labels.values()]
+    columns = [table.texts(_position(table, c)) for c in labels.values()]
     if trigger is not None:
-        (values,) = read_blocks(path, fields, [_position(path, fields, trigger)], mapping.dialect)
+        (values,) = table.numbers([_position(table, trigger)])
         columns.append((values[:, 0] > mapping.threshold).tolist())
     start, counts = 0, Counter[Any]()
     for state, rows in groupby(zip(*columns, strict=True)):
@@ -377,10 +362,10 @@ def _stretches(
             yield dict(zip(labels, state, strict=False)), number, (first, start)
     if trigger is not None and not any(state[-1] for state in counts):
         problem = f"column {trigger!r} is nowhere above {mapping.threshold:g}"
-        raise DataError(f"Reading {path}: {problem}; lower the threshold, or exclude the file.")
+        raise DataError(f"Reading {table.path}: {problem}; lower the threshold, or exclude the file.")
 
 
-def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
+def _absent(mapping: CsvMapping, fields: Names, optional: Collection[str]) -> set[str]:
     """Return the channels that are not there and need not be: those that are optional, and truths."""
     spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
     known = {*fields, *range(1, len(fields) + 1)}
@@ -414,27 +399,23 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         log.warning(text, len(others), source, mapping.files, some(others))
 
 
-def _place(
-    path: Path, fields: list[str], stated: list[str], mapping: CsvMapping, unit: UnitMapping, known: dict[Column, str]
-) -> FilePlace:
+def _place(table: Table, mapping: CsvMapping, unit: UnitMapping, known: dict[Column, str]) -> FilePlace:
     """Return where the channels of a unit are in a file."""
     wanted = [] if mapping.time is None else [(mapping.time, mapping.time_unit)]
     wanted += [(mapping.column(channel, unit), channel.column_unit) for channel in mapping.ordered]
-    numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for (c, _), f in zip(wanted, fields, strict=False))
+    numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for (c, _), f in zip(wanted, table.fields, strict=False))
     if mapping.header and numbered:
-        problem = f"one header line is needed, found numbers in the first line: {fields}"
-        raise DataError(f"Reading {path}: {problem}; put the names of the columns first, or set header = false.")
-    at = tuple(_position(path, fields, *column) for column in wanted)
-    conversion = tuple(_conversion(path, *column, stated[i], known) for column, i in zip(wanted, at, strict=True))
+        problem = f"one header line is needed, found numbers in the first line: {list(table.fields)}"
+        raise DataError(f"Reading {table.path}: {problem}; put the names of the columns first, or set header = false.")
+    at = tuple(_position(table, *column) for column in wanted)
+    conversion = tuple(_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True))
     changed = any(pair != (1.0, 0.0) for pair in conversion)
-    return FilePlace(str(path), tuple(fields), at, conversion if changed else ())
+    return FilePlace(table, at, conversion if changed else ())
 
 
-def _conversion(
-    path: Path, column: Column, declared: str, stated: str, known: dict[Column, str]
-) -> tuple[float, float]:
+def _conversion(table: Table, at: int, column: Column, declared: str, known: dict[Column, str]) -> tuple[float, float]:
     """Return factor and offset from the unit that a file states of a column to the one that is declared."""
-    declared = declared or (split_header(column)[1] if isinstance(column, str) else "")
+    stated, declared = table.units[at], declared or split_header(str(column))[1]
     usual = declared or (known.setdefault(column, stated) if stated else "")
     if not stated or clean_unit(usual) == stated:
         return 1.0, 0.0
@@ -443,12 +424,13 @@ def _conversion(
         problem = (
             f"column {column!r} is in {stated!r}, and {'declared' if declared else 'in another file'} in {usual!r}"
         )
-        raise DataError(f"Reading {path}: {problem}; correct the file, or column_unit (time_unit).")
+        raise DataError(f"Reading {table.path}: {problem}; correct the file, or column_unit (time_unit).")
     return theirs.factor / ours.factor, (theirs.offset - ours.offset) / ours.factor
 
 
-def _position(path: Path, fields: list[str], column: Column, unit: str = "") -> int:
+def _position(table: Table, column: Column, unit: str = "") -> int:
     """Return the position of a column by number or name; a declared unit may differ from that in the header."""
+    fields = list(table.fields)
     places = [i for i, field in enumerate(fields) if column in (field, i + 1)]
     name, written = split_header(str(column))
     if not places and (unit or written):
@@ -460,4 +442,4 @@ def _position(path: Path, fields: list[str], column: Column, unit: str = "") -> 
         problem = f"column {column} is asked for, found {len(fields)} columns"
     elif places:
         problem = f"column {column!r} occurs {len(places)} times, found {fields}"
-    raise DataError(f"Reading {path}: {problem}; correct the mapping or the file.")
+    raise DataError(f"Reading {table.path}: {problem}; correct the mapping or the file.")

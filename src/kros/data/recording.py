@@ -83,24 +83,21 @@ class Recording:
 
 @frozen
 class Recordings:
-    """Episodes of a reader, read one at a time; a format overrides `read`. Can be pickled when `places` can."""
+    """Episodes of a reader, read one at a time; a format overrides `blocks`. Can be pickled when `places` can."""
 
     places: Mapping[EpisodeKey, Any]  # where each episode is
-
-    def read(self, key: EpisodeKey, place: Any) -> Recording:
-        """Return one episode as recorded."""
-        raise NotImplementedError
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode."""
         if key not in self.places:
             others = f"this source has {len(self.places)} other episodes"
             raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
-        return self.read(key, self.places[key]).distinct().ended()
+        (recording,) = self.blocks(key)
+        return recording.distinct().ended()
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
-        """Yield one episode in blocks of about `rows` samples where the format can, else whole."""
-        yield self(key)
+    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
+        """Yield one episode as recorded, in blocks of about `rows` samples where the format can, else whole."""
+        raise NotImplementedError
 
     def file(self, place: Any) -> Path | None:
         """Return the one file that an episode is in, where it is in one."""

@@ -237,19 +237,9 @@ class CsvRecordings(Recordings):
         """Return the file of an episode."""
         return place.table.path
 
-    def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
-        """Return one episode as recorded."""
-        (values,), (i, n) = self._values(place, np.inf), place.piece
-        values = values if place.rows is None else values[slice(*place.rows)]
-        part = values[i * len(values) // n : (i + 1) * len(values) // n]
-        return self._recording(key, part, part[:1])
-
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
+    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
         """Yield one episode in blocks, unless it is a part of a file."""
         place = self.places[key]
-        if place.piece[1] > 1 or place.rows is not None:
-            yield self(key)
-            return
         first, last, waiting = np.empty(0), np.empty((0, len(place.wanted))), list[Recording]()
         for values in self._values(place, rows):
             yield from waiting
@@ -260,9 +250,13 @@ class CsvRecordings(Recordings):
 
     def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
         """Yield the columns of a file in blocks, in the units of measure that are declared."""
+        (i, n), part = place.piece, slice(*place.rows or [None])
         factors, offsets = np.array(place.conversion or [(1.0, 0.0)]).T
-        blocks = place.table.numbers(place.wanted, self.timestamp, rows)
-        return (values * factors + offsets if place.conversion else values for values in blocks)
+        whole = n == 1 and place.rows is None
+        for values in place.table.numbers(place.wanted, self.timestamp, rows if whole else np.inf):
+            values = values[part]
+            values = values[i * len(values) // n : (i + 1) * len(values) // n]
+            yield values * factors + offsets if place.conversion else values
 
     def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
         """Return samples with their time, the first column if there is one, since the `first` of an episode."""

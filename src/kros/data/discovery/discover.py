@@ -128,25 +128,30 @@ def _columns(
     source: Path, head: TableHead, tables: Sequence[Table], period_s: float | None
 ) -> tuple[list[TableColumn], Record, dict[str, str]]:
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
-    described = _described(head)
-    numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields[i]]
-    table, samples = _sampled(source, [table for table in tables if table.fields == head.fields], numeric)
-    labels = dict[str, str]()
-    if not period_s and not time_columns([described[i] for i in numeric], samples):
-        labels = label_columns(table)  # of several episodes in a file
+    columns = _described(head)
+    numeric = [c for c in columns if head.is_numeric(c.at)]
+    table, samples = _sampled(source, tables, [c.at for c in numeric])
+    signals = _by_column(numeric, samples)
+    labels = {} if period_s or time_columns(numeric, signals) else label_columns(table)  # of several episodes in a file
     if labels:
         samples = [samples[0][:, rows] for rows in stretches(table, labels.values())[: RULE.sampled]]
-    time, keys, notes = None, Record(sample_period_s=period_s), dict[str, str]()
+        signals = _by_column(numeric, samples)
+    known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), dict[str, str]()
     if not period_s:
-        time, keys, notes = _time(source, head, described, numeric, samples)
-        described[time] = replace(described[time], part=ColumnPart.TIME)
+        time, keys, notes = _time(source, head, columns, numeric, signals)
+        known[time.at] = replace(time, part=ColumnPart.TIME)
     keys |= {"labels": labels} if labels else {}
-    proposed = dict(zip(numeric, propose([described[i] for i in numeric], samples), strict=True))
-    for i, column in enumerate(described):
-        described[i] = proposed.get(i, column if i == time else replace(column, why="no numbers"))
+    for column in columns:
         if column.header in labels.values():
-            described[i] = replace(column, why="says which unit, condition or episode a row belongs to")
-    return [c for c, name in zip(described, head.fields, strict=True) if name], keys, notes
+            known[column.at] = replace(column, why="says which unit, condition or episode a row belongs to")
+    proposed = propose([c for c in numeric if c.at not in known], signals)
+    known = {c.at: c for c in proposed} | known
+    return [known.get(c.at, replace(c, why="no numbers")) for c in columns], keys, notes
+
+
+def _by_column(columns: Sequence[TableColumn], samples: Sequence[Array]) -> dict[int, list[Array]]:
+    """Return the signals of every column by its place in the table."""
+    return {c.at: [sample[i] for sample in samples] for i, c in enumerate(columns)}
 
 
 def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[int]) -> tuple[Table, list[Array]]:
@@ -172,30 +177,33 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[int]) -> t
 
 
 def _described(head: TableHead) -> list[TableColumn]:
-    """Return the columns by their headers, without parts."""
+    """Return the columns that have a header, or all where there is none, without parts."""
     described = list[TableColumn]()
     for i, (header, unit) in enumerate(zip(head.fields, head.units, strict=True)):
-        column = describe(header or f"column {i + 1}", unit, [c.name for c in described])
-        if not head.dialect.header or head.fields.count(header) > 1:
-            column = replace(column, header=header if head.dialect.header else str(i + 1), number=i + 1)
-        described.append(column)
+        if header:
+            column = describe(header, unit, [c.name for c in described])
+            alone = head.dialect.header and head.fields.count(header) == 1
+            described.append(replace(column, at=i, header=header if head.dialect.header else str(i + 1), alone=alone))
     return described
 
 
 def _time(
-    source: Path, head: TableHead, columns: Sequence[TableColumn], numeric: Sequence[int], samples: Sequence[Array]
-) -> tuple[int, Record, dict[str, str]]:
+    source: Path,
+    head: TableHead,
+    columns: Sequence[TableColumn],
+    numeric: Sequence[TableColumn],
+    signals: dict[int, list[Array]],
+) -> tuple[TableColumn, Record, dict[str, str]]:
     """Return the column of time, the keys of a mapping that describe it, and what they rest on."""
-    candidates = time_columns([columns[i] for i in numeric], samples)
-    texts = [i for i in range(len(columns)) if head.timestamp(i) is not None]
-    if candidates and (not texts or columns[numeric[candidates[0]]].kind == "time"):
-        at = numeric[candidates[0]]
-        scale, why = time_scale(columns[at], float(np.median(np.diff(samples[0][candidates[0]]))))
-        keys: Record = {"time": columns[at].reference}
-        keys |= {"time_unit": columns[at].recorded} if columns[at].recorded else {}
-        return (at, keys, {}) if scale == 1 else (at, keys | {"time_scale": scale}, {"time_scale": why})
+    candidates, stamps = time_columns(numeric, signals), {c: head.timestamp(c.at) for c in columns}
+    texts = [c for c, order in stamps.items() if order is not None]
+    if candidates and (not texts or candidates[0].kind == "time"):
+        time = candidates[0]
+        scale, why = time_scale(time, float(np.median(np.diff(signals[time.at][0]))))
+        keys: Record = {"time": time.reference} | ({"time_unit": time.recorded} if time.recorded else {})
+        return (time, keys, {}) if scale == 1 else (time, keys | {"time_scale": scale}, {"time_scale": why})
     if texts:
-        return texts[-1], {"time": columns[texts[-1]].reference, "timestamp": head.timestamp(texts[-1])}, {}
+        return texts[-1], {"time": texts[-1].reference, "timestamp": stamps[texts[-1]]}, {}
     called = next((c.header for c in columns if c.kind == "time"), None)
     problem = f"{called!r} stands still or runs back in places, as rounded times do" if called else "no column is time"
     found = ", ".join(repr(c.header) for c in columns)
@@ -213,16 +221,18 @@ def _channel(column: TableColumn) -> Record:
 
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
     """Return the columns with measured states and inputs as named, where any are named, else as proposed."""
-    decided = list(columns)
-    freed = {ColumnPart.MEASURED: ColumnPart.STATE, ColumnPart.INPUT: ColumnPart.LEFT_OUT}
-    for part, names in ((ColumnPart.MEASURED, wanted.measured), (ColumnPart.INPUT, wanted.inputs)):
+    decided, measured, given = list(columns), ColumnPart.MEASURED, ColumnPart.INPUT
+    for part, names, freed in (
+        (measured, wanted.measured, ColumnPart.STATE),
+        (given, wanted.inputs, ColumnPart.LEFT_OUT),
+    ):
         places = [_place(decided, name) for name in names]
-        if places:
-            decided = [replace(c, part=freed[part]) if c.part is part else c for c in decided]
-        for i in places:
-            decided[i] = replace(decided[i], part=part, why="as named")
-    needed = {ColumnPart.MEASURED: ("a measured state", "--measured"), ColumnPart.INPUT: ("an input", "--input")}
-    for part, (what, option) in needed.items():
+        for i, column in enumerate(decided):
+            if i in places:
+                decided[i] = replace(column, part=part, why="as named")
+            elif places and column.part is part:
+                decided[i] = replace(column, part=freed)
+    for part, what, option in ((measured, "a measured state", "--measured"), (given, "an input", "--input")):
         if not any(c.part is part for c in decided):
             free = [c for c in decided if c.part is not ColumnPart.TIME]
             known = ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in free)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 
@@ -55,7 +55,7 @@ class ColumnPart(str, Enum):
 class TableColumn:
     """A column of the recordings."""
 
-    header: str  # as in the files; the number of the column where there is no header
+    header: str  # as in the files; the number of the column where there is no header, from 1
     name: str  # of the channel
     unit: str = ""  # unit of measure of the channel, after scaling
     scale: float = 1.0  # to the channel
@@ -64,12 +64,13 @@ class TableColumn:
     kind: str = ""  # kind of quantity, or nothing
     part: ColumnPart = ColumnPart.LEFT_OUT
     why: str = ""  # what the proposal rests on
-    number: int | None = None  # of the column, from 1, where its header does not name it alone
+    at: int = 0  # place among the columns
+    alone: bool = True  # whether its header names it alone
 
     @property
     def reference(self) -> str | int:
         """How a mapping names the column."""
-        return self.header if self.number is None else self.number
+        return self.header if self.alone else self.at + 1
 
 
 def identifier(text: str, taken: Collection[str] = ()) -> str:
@@ -109,18 +110,22 @@ def kind_of(name: str, unit: str = "") -> str:
     return next(quantities, "") if kind == "other" else kind
 
 
-def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[int]:
+def time_columns(columns: Sequence[TableColumn], signals: Mapping[int, Sequence[Array]]) -> list[TableColumn]:
     """Return the columns that may be time, the likeliest first: called so, or increasing evenly, in most samples."""
-    rising = [i for i in range(len(columns)) if samples and np.mean([_rises(s[i]) for s in samples]) > 0.5]
-    called = [i for i in rising if columns[i].kind == "time"]
-    other = [i for i in rising if i not in called and not all(_counts(s[i]) for s in samples)]
-    steps = {i: [np.diff(s[i]) / np.median(np.diff(s[i])) for s in samples] for i in other}
-    return called + [i for i in other if all(np.mean(np.abs(s - 1) < 0.5) > 0.9 for s in steps[i])]
+    rising = [c for c in columns if np.mean([_rises(s) for s in signals[c.at]]) > 0.5]
+    called = [c for c in rising if c.kind == "time"]
+    other = [c for c in rising if c not in called and not all(map(_counts, signals[c.at]))]
+    return called + [c for c in other if all(map(_is_even, signals[c.at]))]
 
 
 def _rises(column: Array) -> bool:
     steps = np.diff(column)
     return bool(len(steps) and np.isfinite(column).all() and np.mean(steps > 0) > 0.99 and (steps >= 0).all())
+
+
+def _is_even(column: Array) -> bool:
+    steps = np.diff(column)
+    return bool(np.mean(np.abs(steps / np.median(steps) - 1) < 0.5) > 0.9)
 
 
 def _counts(column: Array) -> bool:
@@ -137,14 +142,12 @@ def time_scale(column: TableColumn, step: float) -> tuple[float, str]:
     return 1.0, f"a step of {step:g} fits no unit of time: correct time_scale"
 
 
-def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[TableColumn]:
-    """Return the columns with the part that each is likely to have; time is known already."""
+def propose(columns: Sequence[TableColumn], signals: Mapping[int, Sequence[Array]]) -> list[TableColumn]:
+    """Return the columns, without that of time, with the part that each is likely to have."""
     proposed = list[TableColumn]()
-    for i, column in enumerate(columns):
-        part, why = column.part, column.why
-        if part is not ColumnPart.TIME:
-            spare = _spare(i, column, samples)
-            part, why = (ColumnPart.LEFT_OUT, spare) if spare else _by_name(column)
+    for column in columns:
+        spare = _spare(column, signals[column.at])
+        part, why = (ColumnPart.LEFT_OUT, spare) if spare else _by_name(column)
         proposed.append(replace(column, part=part, why=why))
     free = [c.kind for c in proposed if c.part is ColumnPart.STATE]
     first = next((kinds for kinds in _FIRST_MEASURED if set(kinds) & set(free)), ())
@@ -152,9 +155,8 @@ def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[Ta
     return [replace(c, part=ColumnPart.MEASURED) if c in measured else c for c in proposed]
 
 
-def _spare(i: int, column: TableColumn, samples: Sequence[Array]) -> str:
+def _spare(column: TableColumn, signals: Sequence[Array]) -> str:
     """Return why a column is not needed, or nothing."""
-    signals = [s[i] for s in samples]
     if all(np.isnan(s).mean() > 0.1 for s in signals):
         return "mostly empty or text"
     ends = {float(end) for s in signals for end in (np.fmin.reduce(s), np.fmax.reduce(s)) if not np.isnan(end)}

@@ -247,24 +247,24 @@ class GroupWatch:
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         self._channels = channels
-        self._resting: list[dict[int, float]] = []
-        # of every episode: quantiles (3, n), ranges (n,), the samples that are farthest from the median, and values
-        self._signals: dict[EpisodeKey, tuple[Array, Array, Index, Array]] = {}
+        # of every episode: quantiles (3, n), ranges (n,), the samples that are farthest from the median, values there,
+        # and where channels rest, NaN for one that moves
+        self._looks: dict[EpisodeKey, tuple[Array, Array, Index, Array, Array]] = {}
 
     def add(self, key: EpisodeKey, values: Array) -> None:
         """Look at one more episode, all of whose samples are usable."""
-        signals = [i for i, c in enumerate(self._channels) if c.role is not Role.TRUTH]
-        self._resting.append({i: float(values[0, i]) for i in signals if is_constant(values[:, i])})
         outside = max(1, len(values) // 100)  # at each end; one at least, for short episodes
         rows = [outside, len(values) // 2, len(values) - 1 - outside]
         quantiles = np.partition(values, rows, axis=0)[rows]
         at = np.abs(values - quantiles[1]).argmax(axis=0)
-        self._signals[key] = quantiles, np.ptp(values, axis=0), at, values[at, np.arange(len(at))]
+        resting = np.where([is_constant(signal) for signal in values.T], values[0], np.nan)
+        self._looks[key] = quantiles, np.ptp(values, axis=0), at, values[at, np.arange(len(at))], resting
 
     def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
         """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, median range) > 0, and the place."""
-        for key, ((low, middle, high), _, samples, values) in self._signals.items():
-            usual = np.quantile([of[1] for of in self._signals.values()], 0.5, axis=0, method="lower")
+        ranges = [look[1] for look in self._looks.values()]
+        usual = np.quantile(ranges, 0.5, axis=0, method="lower") if ranges else np.zeros(1)
+        for key, ((low, middle, high), _, samples, values, _) in self._looks.items():
             size = np.max([high - low, np.abs(low), np.abs(high), usual], axis=0)  # it may rest in 99 % of an episode
             for i in map(int, np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))):
                 actual = f"{values[i]:g} at sample {samples[i]}"
@@ -275,13 +275,14 @@ class GroupWatch:
         """Raise DataError for wild samples, and for an input or a state that never changed."""
         for key, problem in self.wild():
             raise DataError(f"{title(key)}: {problem}; fix the source, or leave the episode out.")
-        first = self._resting[0] if self._resting else {}
-        for i in sorted(set(first).intersection(*self._resting)):
-            key, channel = next(iter(self._signals)), self._channels[i]
-            if channel.role is Role.INPUT and any(resting[i] != first[i] for resting in self._resting):
-                continue  # it differs from episode to episode
+        rests = np.array([look[-1] for look in self._looks.values()]).T
+        for channel, rest in zip(self._channels, rests, strict=False):
+            differs = channel.role is Role.INPUT and (rest != rest[0]).any()  # from episode to episode
+            if channel.role is Role.TRUTH or differs or np.isnan(rest).any():
+                continue
+            key = next(iter(self._looks))
             what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays where it is"
-            place = f"in each of {len(self._resting)} episodes, in the first at {first[i]:g}"
+            place = f"in each of {len(rest)} episodes, in the first at {rest[0]:g}"
             raise DataError(f"{what} {place}; check the sensor and the column, or remove the channel or the unit.")
 
 
@@ -323,10 +324,9 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
         raise DataError(f"A channel with role 'truth' {wanted}, found {truths}; correct them.")
     if not episodes:
         raise DataError("The population is empty: no episode was found; check the source and the reader.")
-    copies = [(key, count) for key, count in Counter(episodes).items() if count > 1]
-    if copies:
-        actual = f"{copies[0][0]} occurs {copies[0][1]} times ({len(copies)} such episodes)"
-        raise DataError(f"Duplicate episodes: {actual}; rename or remove the copies.")
+    ((key, count),) = Counter(episodes).most_common(1)
+    if count > 1:
+        raise DataError(f"Duplicate episodes: {key} occurs {count} times; rename or remove the copies.")
 
 
 def check_population(population: Population, allow_single: bool = False) -> None:

@@ -298,7 +298,7 @@ def check_names(kind: str, names: Iterable[Any]) -> None:
 def check_period(period_s: Any, what: str) -> float:
     """Return a sampling period that is a number of seconds above zero."""
     is_number = isinstance(period_s, Real) and not isinstance(period_s, bool)
-    if not is_number or not 1 / limits.MAX_VALUE < period_s < limits.MAX_VALUE:
+    if not is_number or not 1 / limits.MAX_VALUE < float(period_s) < limits.MAX_VALUE:
         wanted, actual = "should be a number of seconds above zero", shortened(repr(period_s))
         raise DataError(f"{what}: the sampling period {wanted}, found {actual}; give it in seconds.")
     return float(period_s)

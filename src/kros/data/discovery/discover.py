@@ -25,7 +25,7 @@ from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
-from .labels import label_columns, stretches
+from .labels import label_columns, labelled
 from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
@@ -120,7 +120,7 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], dict[st
         if needed - {""} <= names if head.dialect.header else len(table.fields) == len(head.fields):
             alike[relative] = table
         else:
-            strange[relative] = f"has the columns {', '.join(table.fields)}"
+            strange[relative] = f"has the columns {list(table.fields)}"
     return head, alike, strange
 
 
@@ -134,7 +134,7 @@ def _columns(
     signals = _by_column(numeric, samples)
     labels = {} if period_s or time_columns(numeric, signals) else label_columns(table)  # of several episodes in a file
     if labels:
-        samples = [samples[0][:, rows] for rows in stretches(table, labels.values())[: RULE.sampled]]
+        samples = [samples[0][:, rows] for rows in labelled(table, labels.values())[: RULE.sampled]]
         signals = _by_column(numeric, samples)
     known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), dict[str, str]()
     if not period_s:
@@ -297,7 +297,8 @@ def _resampling(
     bridged = sum(s.nan for s in looks)
     if even and not bridged:
         return (), []
-    recorded = f"(recorded at {min(s.period_s for s in looks):.4g} to {max(s.period_s for s in looks):.4g} s)"
+    ends = (f"{end(s.period_s for s in looks):.4g}" for end in (min, max))
+    recorded = f"(recorded at {' to '.join(dict.fromkeys(ends))} s)"
     text = "time is uneven" if uneven else "sampling periods differ"
     text = f"NaN in {bridged} episodes is bridged by straight lines" if even else text
     text += f": all episodes are resampled to a period of {period_s:g} s {recorded}"

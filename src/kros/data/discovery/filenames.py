@@ -19,8 +19,8 @@ _WORDS = {
     UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder "
     "pump valve design joint sample specimen antrieb maschine geraet gerät pruefling prüfling einheit anlage moteur "
     "variateur part id",
-    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung day session "
-    "versuch lauf aufnahme essai mesure meas nr no",
+    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung day "
+    "session versuch lauf aufnahme essai mesure meas nr no",
     CONDITION: "condition cond load config mode case temp last bedingung zustand charge",
 }
 _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words.split()}

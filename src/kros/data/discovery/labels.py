@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import accumulate, groupby
 
-from ..readers.tables import Table
+from ..readers.tables import Table, stretches
 from .roles import identifier
 
 _ROLES = {
@@ -22,14 +21,12 @@ def label_columns(table: Table) -> dict[str, str]:
     for field in table.fields:
         words = set(identifier(f"{field} ").lower().split("_"))
         role = next((role for role, known in _ROLES.items() if words <= set(known.split())), None)
-        rows = stretches(table, [field]) if role else []
+        rows = labelled(table, [field]) if role else []
         if role and 1 < len(rows) < rows[-1].stop / 10:
             labels.setdefault(role, field)
     return labels
 
 
-def stretches(table: Table, labels: Iterable[str]) -> list[slice]:
+def labelled(table: Table, labels: Iterable[str]) -> list[slice]:
     """Return the rows of every episode in a file."""
-    columns = [table.texts(table.fields.index(field)) for field in labels]
-    counts = [len(list(rows)) for _, rows in groupby(zip(*columns, strict=True))]
-    return [slice(end - count, end) for end, count in zip(accumulate(counts), counts, strict=True)]
+    return [rows for _, rows in stretches([table.texts(table.fields.index(field)) for field in labels])]

@@ -10,7 +10,7 @@ import numpy as np
 from ...core import Array, ByName, DataError, frozen, shortened
 from ..population import DEFAULT_CONDITION, Channel, Channels, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
-from ..recording import Recording, Recordings, check_period, title
+from ..recording import Recording, Recordings, check_period, check_structure, title
 
 
 @frozen
@@ -101,7 +101,8 @@ def from_arrays(
     declared = declare_channels(channels, states, inputs, measured, "from_arrays")
     columns = columns_in_order(declared)
     order = [declared.index(c) for c in columns]
-    episodes = _episodes(data)
+    episodes = list(_episodes(data))
+    check_structure(columns, [key for key, _ in episodes])  # 1 and "1" are one unit
     places = {key: (np.ascontiguousarray(_samples(key, one, declared)[:, order]), None) for key, one in episodes}
     return assemble(ArrayRecordings(places), columns, units, sample_period_s, metadata)
 

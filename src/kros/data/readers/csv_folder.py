@@ -8,8 +8,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
-from itertools import groupby
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,7 +32,7 @@ from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import STEPS, Scale, Step
 from .formats import FORMATS
-from .tables import TIMESTAMP_SCALE, Dialect, Table
+from .tables import TIMESTAMP_SCALE, Dialect, Table, stretches
 
 Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
@@ -217,13 +216,14 @@ _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class FilePlace:
-    """Where an episode is: a table, the positions of its columns that are wanted (time first), rows, and which piece."""
+    """Where an episode is: a table, the columns that are wanted (time first), rows of it, and which piece of these."""
 
     table: Table
     wanted: Columns
-    conversion: tuple[tuple[float, float], ...] = ()  # factor and offset of those wanted, where units differ
-    rows: tuple[int, int] | None = None
-    piece: tuple[int, int] = (0, 1)  # of how many
+    factors: tuple[float, ...]  # to the declared units of measure of those wanted
+    offsets: tuple[float, ...]
+    rows: slice
+    piece: tuple[int, int]  # of how many
 
 
 @frozen
@@ -250,13 +250,11 @@ class CsvRecordings(Recordings):
 
     def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
         """Yield the columns of a file in blocks, in the units of measure that are declared."""
-        (i, n), part = place.piece, slice(*place.rows or [None])
-        factors, offsets = np.array(place.conversion or [(1.0, 0.0)]).T
-        whole = n == 1 and place.rows is None
+        (i, n), whole = place.piece, (place.piece, place.rows) == ((0, 1), slice(None))
         for values in place.table.numbers(place.wanted, self.timestamp, rows if whole else np.inf):
-            values = values[part]
+            values = values[place.rows]
             values = values[i * len(values) // n : (i + 1) * len(values) // n]
-            yield values * factors + offsets if place.conversion else values
+            yield values * place.factors + place.offsets
 
     def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
         """Return samples with their time, the first column if there is one, since the `first` of an episode."""
@@ -296,7 +294,7 @@ def read_csv_folder(
             continue
         for key, place in episodes:
             part = part_of(relative, key)
-            if place.rows is not None and chosen.exclude and re.search(chosen.exclude, part):
+            if place.rows != slice(None) and chosen.exclude and re.search(chosen.exclude, part):
                 continue
             if key in places:
                 twice = f"{key} is in {places[key].table.path} and in {path}"
@@ -309,7 +307,9 @@ def read_csv_folder(
     if not places:
         files, endings = [relative for _, relative in csv_files(source)], ", ".join(ENDINGS[:4])
         sample = f" of {len(files)} files such as {files[0]!r}" if files else ""
-        actual = f"no file matches files = {chosen.files!r}{sample or f'; there is no file that ends in {endings}'}"
+        left_out = f" without exclude = {chosen.exclude!r}" if chosen.exclude else ""
+        none = sample or f"; there is no file that ends in {endings}"
+        actual = f"no file matches files = {chosen.files!r}{left_out}{none}"
         raise DataError(f"Reading {source} as csv: {actual}; correct the expression.")
     time_scale = None if chosen.time is None else chosen.time_scale
     recordings = CsvRecordings(places, time_scale, chosen.timestamp)
@@ -327,33 +327,32 @@ def _episodes(
     table: Table, named: dict[str, str], mapping: CsvMapping, known: dict[Column, str]
 ) -> Iterator[tuple[EpisodeKey, FilePlace]]:
     """Yield the episodes of a file, of which its name says some parts; `known` are units of measure of other files."""
-    places = [(unit.suffix, _place(table, mapping, unit, known)) for unit in mapping.units]
+    places = [(unit.suffix, _places(table, mapping, unit, known)) for unit in mapping.units]
     for labels, number, rows in _stretches(table, mapping):
         parts = {"unit": "unit", "condition": DEFAULT_CONDITION, "episode": "0", **named, **labels}
         for suffix, place in places:
             for i in range(mapping.pieces):
                 episode = parts["episode"] + number + (f".{i + 1}" if mapping.pieces > 1 else "")
                 key = EpisodeKey(parts["unit"] + suffix, parts["condition"], episode)
-                yield key, replace(place, rows=rows, piece=(i, mapping.pieces))
+                yield key, FilePlace(table, *place, rows, (i, mapping.pieces))
 
 
-def _stretches(table: Table, mapping: CsvMapping) -> Iterator[tuple[dict[str, str], str, tuple[int, int] | None]]:
-    """Yield what columns state of every episode in a file, its number and its rows; None where it is the whole file."""
+def _stretches(table: Table, mapping: CsvMapping) -> Iterator[tuple[dict[str, str], str, slice]]:
+    """Yield what columns state of every episode in a file, its number and its rows."""
     labels, trigger = mapping.labels, mapping.trigger
     if not labels and trigger is None:
-        yield {}, "", None
+        yield {}, "", slice(None)
         return
     columns = [table.texts(_position(table, c)) for c in labels.values()]
     if trigger is not None:
         (values,) = table.numbers([_position(table, trigger)])
         columns.append((values[:, 0] > mapping.threshold).tolist())
-    start, counts = 0, Counter[Any]()
-    for state, rows in groupby(zip(*columns, strict=True)):
-        start, first = start + sum(1 for _ in rows), start
+    counts = Counter[Any]()
+    for state, rows in stretches(columns):
         counts[state] += 1
         if trigger is None or state[-1]:
             number = "" if trigger is None else f".{counts[state]}"
-            yield dict(zip(labels, state, strict=False)), number, (first, start)
+            yield dict(zip(labels, state, strict=False)), number, rows
     if trigger is not None and not any(state[-1] for state in counts):
         problem = f"column {trigger!r} is nowhere above {mapping.threshold:g}"
         raise DataError(f"Reading {table.path}: {problem}; lower the threshold, or exclude the file.")
@@ -393,8 +392,10 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         log.warning(text, len(others), source, mapping.files, some(others))
 
 
-def _place(table: Table, mapping: CsvMapping, unit: UnitMapping, known: dict[Column, str]) -> FilePlace:
-    """Return where the channels of a unit are in a file."""
+def _places(
+    table: Table, mapping: CsvMapping, unit: UnitMapping, known: dict[Column, str]
+) -> tuple[Columns, tuple[float, ...], tuple[float, ...]]:
+    """Return where the channels of a unit are in a file, with factors and offsets to their units of measure."""
     wanted = [] if mapping.time is None else [(mapping.time, mapping.time_unit)]
     wanted += [(mapping.column(channel, unit), channel.column_unit) for channel in mapping.ordered]
     numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for (c, _), f in zip(wanted, table.fields, strict=False))
@@ -402,9 +403,8 @@ def _place(table: Table, mapping: CsvMapping, unit: UnitMapping, known: dict[Col
         problem = f"one header line is needed, found numbers in the first line: {list(table.fields)}"
         raise DataError(f"Reading {table.path}: {problem}; put the names of the columns first, or set header = false.")
     at = tuple(_position(table, *column) for column in wanted)
-    conversion = tuple(_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True))
-    changed = any(pair != (1.0, 0.0) for pair in conversion)
-    return FilePlace(table, at, conversion if changed else ())
+    pairs = [_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True)]
+    return at, tuple(factor for factor, _ in pairs), tuple(offset for _, offset in pairs)
 
 
 def _conversion(table: Table, at: int, column: Column, declared: str, known: dict[Column, str]) -> tuple[float, float]:

@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import IO, Any
 
@@ -172,6 +173,14 @@ def lines_of(content: bytes, encoding: str, path: Path) -> list[str]:
 def cells_of(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line, without surrounding space and quotes."""
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
+
+
+def stretches(columns: Sequence[Sequence[Any]]) -> Iterator[tuple[tuple[Any, ...], slice]]:
+    """Yield what columns hold where they stay the same, and these rows."""
+    start = 0
+    for state, rows in groupby(zip(*columns, strict=True)):
+        start, first = start + sum(1 for _ in rows), start
+        yield state, slice(first, start)
 
 
 class LimitedFile:

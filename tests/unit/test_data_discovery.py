@@ -44,39 +44,39 @@ def names(template: str, **other: object) -> list[str]:
 )
 def test_names_of_files(template, first):
     paths = names(template)
-    found = infer_names(paths)
-    groups = re.search(found.pattern, paths[0])
+    pattern, _ = infer_names(paths)
+    groups = re.search(pattern, paths[0])
     assert groups is not None
     assert tuple(groups.groupdict().get(g) for g in ("unit", "condition", "episode")) == first
-    assert len({tuple(m.groupdict().items()) for p in paths if (m := re.search(found.pattern, p))}) == len(paths)
+    assert len({tuple(m.groupdict().items()) for p in paths if (m := re.search(pattern, p))}) == len(paths)
 
 
 def test_conditions_groups_and_single_machines():
-    assert "(?P<condition>" in infer_names([f"rig{u}_{p}bar.csv" for u in UNITS for p in (3, 5)]).pattern
+    assert "(?P<condition>" in infer_names([f"rig{u}_{p}bar.csv" for u in UNITS for p in (3, 5)])[0]
     assert (
         "(?P<group>"
-        in infer_names([f"{'outliers' if u == 3 else 'good'}/m{u}_{e}.csv" for u in UNITS for e in EPISODES]).pattern
+        in infer_names([f"{'outliers' if u == 3 else 'good'}/m{u}_{e}.csv" for u in UNITS for e in EPISODES])[0]
     )
-    batches = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
-    assert re.search(batches.pattern, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
+    batches, _ = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
+    assert re.search(batches, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
     seals = ["K_N_1bar.csv", "K_N_3bar.csv", "NAP310_1bar.csv", "NAP310_3bar.csv", "rig__O-ring257_1bar.csv"]
-    found = [re.search(infer_names(seals).pattern, name).groupdict() for name in seals]
+    found = [re.search(infer_names(seals)[0], name).groupdict() for name in seals]
     assert [(m["unit"], m["condition"]) for m in found][1:] == [
         ("K_N", "3bar"),
         ("NAP310", "1bar"),
         ("NAP310", "3bar"),
         ("rig__O-ring257", "1bar"),
     ]
-    halls = infer_names([f"hall{h}/crane{u:02d}/run{e}.csv" for h in (1, 2) for u in UNITS for e in EPISODES])
-    assert re.search(halls.pattern, "hall1/crane02/run3.csv").groupdict() == {
+    halls, _ = infer_names([f"hall{h}/crane{u:02d}/run{e}.csv" for h in (1, 2) for u in UNITS for e in EPISODES])
+    assert re.search(halls, "hall1/crane02/run3.csv").groupdict() == {
         "unit": "hall1/crane02",
         "episode": "run3",
     }
-    days = infer_names([f"pump{u}/day{d}/run{e}.csv" for u in UNITS for d in (1, 2) for e in EPISODES])
-    assert re.search(days.pattern, "pump2/day1/run3.csv").groupdict() == {"unit": "pump2", "episode": "day1/run3"}
-    single = infer_names([f"qube_20240101T12{e}{e}00_43{e}_7{e}.csv" for e in EPISODES])
-    assert "(?P<unit>" not in single.pattern
-    assert infer_names(["only.csv"]).pattern == r"^only\.csv$"
+    days, _ = infer_names([f"pump{u}/day{d}/run{e}.csv" for u in UNITS for d in (1, 2) for e in EPISODES])
+    assert re.search(days, "pump2/day1/run3.csv").groupdict() == {"unit": "pump2", "episode": "day1/run3"}
+    single, _ = infer_names([f"qube_20240101T12{e}{e}00_43{e}_7{e}.csv" for e in EPISODES])
+    assert "(?P<unit>" not in single
+    assert infer_names(["only.csv"])[0] == r"^only\.csv$"
 
 
 @pytest.mark.parametrize(
@@ -120,12 +120,12 @@ def test_conditions_groups_and_single_machines():
     ],
 )
 def test_hostile_layouts_are_read_as_people_do_or_asked_about(paths, first, units, ambiguous):
-    found = infer_names(sorted(set(paths), key=paths.index))
-    groups = [re.search(found.pattern, p).groupdict() for p in paths]
+    pattern, other = infer_names(sorted(set(paths), key=paths.index))
+    groups = [re.search(pattern, p).groupdict() for p in paths]
     assert tuple(groups[0].get(g) for g in ("group", "unit", "condition", "episode")) == first
     assert len({g.get("unit") for g in groups}) == units
-    assert (found.other is not None) == ambiguous
-    assert found.other is None or len({re.search(found.other, p)["episode"] for p in paths}) == units
+    assert (other is not None) == ambiguous
+    assert other is None or len({re.search(other, p)["episode"] for p in paths}) == units
 
 
 @pytest.mark.parametrize(

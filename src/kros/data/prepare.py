@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -12,15 +13,7 @@ from pydantic import ValidationError
 
 from ..core import Array, ByName, ConfigError, DataError, digest_of, frozen, shortened, stamp_of, united
 from .population import Channels, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key
-from .recording import (
-    Recording,
-    Recordings,
-    check_even,
-    check_period,
-    check_structure,
-    checked_blocks,
-    estimate_period,
-)
+from .recording import Recording, Recordings, check_even, check_period, check_structure, checked_blocks, estimate_period
 from .steps import STEPS, Signals, Step
 
 HEAD = 100_000  # samples whose median step is the period
@@ -121,13 +114,10 @@ def described(signals: Signals, steps: Iterable[Step]) -> Signals:
 
 def _first_period(recordings: Recordings, episodes: Sequence[EpisodeKey]) -> tuple[float, EpisodeKey]:
     """Return the sampling period of the first episode whose beginning can be read, and this episode."""
-    problems = list[DataError]()
     for key in episodes:
-        try:
+        with suppress(DataError):
             return estimate_period(next(recordings.blocks(key, HEAD))), key
-        except DataError as error:
-            problems.append(error)
-    raise problems[0]
+    return estimate_period(recordings(episodes[0])), episodes[0]  # says why not
 
 
 def with_gaps(population: Population) -> Population:

@@ -60,13 +60,13 @@ def discover(
     """Describe a folder of tables; an episode needs at least the `fewest` samples."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
-    names = infer_names(list(alike))
-    if wanted.files is None and names.other is not None:
+    pattern, other = infer_names(list(alike))
+    if wanted.files is None and other is not None:
         raise ConfigError(
             f"Names of files: {some(list(alike), 3)} can be episodes of one unit or units with one recording each; "
-            f"choose, --files '{names.other}' or --files '{names.pattern}'."
+            f"choose, --files '{other}' or --files '{pattern}'."
         )
-    mapping: Record = {"files": wanted.files or names.pattern}
+    mapping: Record = {"files": wanted.files or pattern}
     mapping |= head.dialect.model_dump(exclude_defaults=True)
     columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
     columns = _decided(columns, wanted)
@@ -160,18 +160,17 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[int]) -> t
     What cannot be used is NaN.
     """
     spread = tables[:: max(1, len(tables) // RULE.sampled)]
-    samples, problem = dict[Table, Array](), "the files have fewer than three rows of numbers; check the folder."
+    samples = dict[Table, Array]()
     for table in dict.fromkeys((*spread, *tables)):
-        try:
-            (values,) = table.numbers(columns)
-        except DataError as error:
-            problem = str(error)
-            continue
-        if len(values) >= CHECK.samples:
-            samples[table] = np.where(usable(values), values, np.nan).T
         if len(samples) == len(spread):
             break
+        with suppress(DataError):
+            (values,) = table.numbers(columns)
+            if len(values) >= CHECK.samples:
+                samples[table] = np.where(usable(values), values, np.nan).T
     if not samples:
+        next(tables[0].numbers(columns))  # says why not, where it cannot be read
+        problem = "the files have fewer than three rows of numbers; check the folder."
         raise DataError(f"Looking at {source}: {problem}")
     return next(iter(samples)), list(samples.values())
 

@@ -11,8 +11,9 @@ import re
 from collections.abc import Sequence
 from itertools import chain, groupby
 
-from ...core import Names, frozen
+from ...core import Names
 from ..population import OUTLIERS
+from ..readers.csv_folder import ENDINGS
 
 UNIT, CONDITION, EPISODE, GROUP = "unit", "condition", "episode", "group"
 _WORDS = {
@@ -34,25 +35,19 @@ _MEASURE = re.compile(
 )
 _DATE = re.compile(r"^(?:19|20)\d{6}(?:T?\d{4,6})?$")
 _DATE_PARTS = (r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*")  # 2024-05-31
-_ENDING = re.compile(r"(.*?)(\.(?:csv|tsv|txt|dat|parquet|mat|h5|hdf5?|mf4|mdf|tdms|bag|mcap|db3)(?:\.gz)?)$", re.I)
 Roles = list[str | None]
 Cut = list[list[str]]  # words of every path, with what is between them
 
 
-@frozen
-class FileNames:
-    """What the paths of a folder say."""
+def infer_names(paths: Sequence[str]) -> tuple[str, str | None]:
+    """Return the expression with the groups `unit`, `condition`, ... that tells files apart, and one that does as well.
 
-    pattern: str  # regular expression with the groups `unit`, `condition`, `episode` and `group`, those that are there
-    other: str | None = None  # a second expression that fits as well: episodes of one unit in place of units
-
-
-def infer_names(paths: Sequence[str]) -> FileNames:
-    """Return the expression that tells the files of a folder apart."""
-    parts = [match.groups() if (match := _ENDING.match(p)) else (p, "") for p in paths]
-    endings = sorted({re.escape(ending) for _, ending in parts if ending})
+    The second takes units for episodes of one unit, where names do not say which they are.
+    """
+    ends = [next((ending for ending in ENDINGS if p.lower().endswith(ending)), "") for p in paths]
+    stems = [p[: len(p) - len(ending)] for p, ending in zip(paths, ends, strict=True)]
+    endings = sorted({re.escape(p[len(stem) :]) for p, stem in zip(paths, stems, strict=True)})
     ending = endings[0] if len(endings) == 1 else f"(?:{'|'.join(endings)})"
-    stems = [stem for stem, _ in parts]
     for cut in (_words(stems), _aligned(stems)):
         if cut is None:
             continue
@@ -63,8 +58,8 @@ def infer_names(paths: Sequence[str]) -> FileNames:
             alone = not sure and roles.count(UNIT) == 1 and not {EPISODE, GROUP} & set(roles)
             numbered = alone and _counts(columns[roles.index(UNIT)])
             episodes: Roles = [EPISODE if role == UNIT else role for role in roles]
-            return FileNames(pattern, _pattern(cut, episodes, ending) if numbered else None)
-    return FileNames(rf"^(?P<unit>.+){ending}$")
+            return pattern, _pattern(cut, episodes, ending) if numbered else None
+    return rf"^(?P<unit>.+){ending}$", None
 
 
 def _counts(words: Sequence[str]) -> bool:

@@ -25,8 +25,17 @@ from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
-from .labels import label_columns, labelled
-from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
+from .roles import (
+    UNKNOWN,
+    ColumnPart,
+    TableColumn,
+    describe,
+    label_columns,
+    labelled,
+    propose,
+    time_columns,
+    time_scale,
+)
 
 _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
 

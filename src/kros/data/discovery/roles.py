@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ...core import Array, frozen
 from ..measures import KINDS, Measure, clean_unit, measure, split_header
+from ..readers.tables import Table, stretches
 from ..recording import CHECK
 
 WORDS = {
@@ -39,6 +40,14 @@ _STATES = ("angle", "position", "velocity", "current", "torque", "force", "press
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
 _LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
 _SPELLED = dict(zip("äöüßÄÖÜΔωφθατ", _LETTERS.split(), strict=True))
+
+
+LABELS = {
+    "unit": "unit serial number sn id name device machine motor drive rig sample specimen cell dut uut asset maschine "
+    "geraet seriennummer nr no",
+    "condition": "condition mode zustand",
+    "episode": "episode run trial test experiment cycle repetition measurement versuch messung lauf",
+}
 
 
 class ColumnPart(str, Enum):
@@ -176,3 +185,20 @@ def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
     if column.kind in _STATES:
         return ColumnPart.STATE, f"{column.kind}, by name or unit"
     return ColumnPart.LEFT_OUT, UNKNOWN
+
+
+def label_columns(table: Table) -> dict[str, str]:
+    """Return the columns whose names and values, which change now and then in a file, say that they label rows."""
+    labels = dict[str, str]()
+    for field in table.fields:
+        words = set(identifier(f"{field} ").lower().split("_"))
+        role = next((role for role, known in LABELS.items() if words <= set(known.split())), None)
+        rows = labelled(table, [field]) if role else []
+        if role and 1 < len(rows) < rows[-1].stop / 10:
+            labels.setdefault(role, field)
+    return labels
+
+
+def labelled(table: Table, labels: Iterable[str]) -> list[slice]:
+    """Return the rows of every episode in a file."""
+    return [rows for _, rows in stretches([table.texts(table.fields.index(field)) for field in labels])]

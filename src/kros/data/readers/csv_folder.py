@@ -17,17 +17,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_vali
 
 from ...core import Array, ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
 from ..measures import clean_unit, measure, split_header
-from ..population import (
-    DEFAULT_CONDITION,
-    Channel,
-    Channels,
-    EpisodeKey,
-    Population,
-    Role,
-    Scaling,
-    Unit,
-    columns_in_order,
-)
+from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import STEPS, Scale, Step
@@ -153,11 +143,6 @@ class CsvMapping(Dialect):
         return columns_in_order(self.channel)
 
     @property
-    def channels(self) -> Channels:
-        """The population's channels."""
-        return tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in self.ordered)
-
-    @property
     def steps(self) -> tuple[Step, ...]:
         """Scaling as declared per channel, then the mapping's own steps."""
         scales = (Scale((c.name,), c.scale, offset=c.offset) for c in self.ordered if (c.scale, c.offset) != (1, 0))
@@ -272,10 +257,7 @@ def read_csv_folder(
     optional: Collection[str] = (),
     damaged: dict[str, str] | None = None,
 ) -> Population:
-    """Read a folder of CSV files, also gzip-compressed; `damaged` collects files that cannot be used, with the reason.
-
-    Without `damaged`, the first of these files is an error.
-    """
+    """Read a folder of CSV files; those that cannot be used are collected in `damaged`, with the reason, or refused."""
     chosen, source = load_mapping(mapping), Path(source)
     dialect, places = chosen.dialect, dict[EpisodeKey, FilePlace]()
     groups, units_of_measure = dict[str, str](), dict[Column, str]()
@@ -313,9 +295,9 @@ def read_csv_folder(
         raise DataError(f"Reading {source} as csv: {actual}; correct the expression.")
     time_scale = None if chosen.time is None else chosen.time_scale
     recordings = CsvRecordings(places, time_scale, chosen.timestamp)
-    units = [Unit(unit, group) for unit, group in groups.items()]
-    facts = (chosen.channels, units, chosen.sample_period_s, chosen.metadata)
-    return assemble(recordings, *facts, steps=chosen.steps, scaling=chosen.scaling)
+    channels = tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in chosen.ordered)
+    facts = ([Unit(unit, group) for unit, group in groups.items()], chosen.sample_period_s, chosen.metadata)
+    return assemble(recordings, channels, *facts, steps=chosen.steps, scaling=chosen.scaling)
 
 
 def part_of(path: str, key: EpisodeKey) -> str:

@@ -99,28 +99,26 @@ class Table:
                 null_values=[*arrow.ConvertOptions().null_values, *ABSENT],
             ),
         )
-        with self._explained(), opened(self.path, dialect.encoding) as file:
-            for batch in arrow.open_csv(pa.PythonFile(file, mode="r"), *options):
-                yield [batch.column(names[i]) for i in wanted]
+        try:
+            with opened(self.path, dialect.encoding) as file:
+                for batch in arrow.open_csv(pa.PythonFile(file, mode="r"), *options):
+                    yield [batch.column(names[i]) for i in wanted]
+        except DataError:
+            raise
+        except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
+            raise self._error(error) from error
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Turn what Arrow says about a file into one error, with the name of a column in place of its number."""
-        import pyarrow as pa
+    def _error(self, error: Exception) -> DataError:
+        """Return what Arrow says about the file, with the name of a column in place of its number from zero."""
 
         def name(match: re.Match[str]) -> str:
             at = int(match[1])
             return f"in column {self.fields[at] if self.dialect.header else at + 1!r}:"
 
-        try:
-            yield
-        except DataError:
-            raise
-        except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
-            pass_on_shortage(error, self.path)
-            text = shortened(re.sub(r"In CSV column #(\d+):", name, str(error)))
-            text = f"a line, or a text in quotes, is longer than {BLOCK} bytes" if "straddling" in text else text
-            raise DataError(f"Reading {self.path}: {text}; correct the file, or the mapping.") from error
+        pass_on_shortage(error, self.path)
+        text = shortened(re.sub(r"In CSV column #(\d+):", name, str(error)))
+        text = f"a line, or a text in quotes, is longer than {BLOCK} bytes" if "straddling" in text else text
+        return DataError(f"Reading {self.path}: {text}; correct the file, or the mapping.")
 
 
 def _columns(path: Path, dialect: Dialect) -> tuple[list[str], list[str]]:

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,17 +24,7 @@ from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
-from .roles import (
-    UNKNOWN,
-    ColumnPart,
-    TableColumn,
-    describe,
-    label_columns,
-    labelled,
-    propose,
-    time_columns,
-    time_scale,
-)
+from .roles import UNKNOWN, ColumnPart, Samples, TableColumn, describe, label_columns, propose, time_columns, time_scale
 
 _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
 
@@ -87,7 +76,9 @@ def discover(
     findings = [f"{alone}; the first {next(iter(strange.values()))}"] if strange else []
     findings += [f"left out, {name}: {why}" for name, why in damaged.items()]
     unused = [name for name in (*strange, *damaged) if re.search(mapping["files"], name)]
-    return _examined(source, draft, findings, unused, fewest, work)
+    found = _examined(source, draft, findings, unused, fewest, work)
+    retained = read_csv_folder(source, found.mapping)
+    return replace(found, population=retained, reading=_reading(retained, source))
 
 
 def _files(source: Path, expression: str | None) -> dict[str, Path]:
@@ -137,77 +128,56 @@ def _columns(
     source: Path, head: TableHead, tables: Sequence[Table], period_s: float | None
 ) -> tuple[list[TableColumn], Record, dict[str, str]]:
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
-    columns = _described(head)
+    columns = describe(head)
     numeric = [c for c in columns if head.is_numeric(c.at)]
-    table, samples = _sampled(source, tables, [c.at for c in numeric])
-    signals = _by_column(numeric, samples)
-    labels = {} if period_s or time_columns(numeric, signals) else label_columns(table)  # of several episodes in a file
+    table, samples = _sampled(source, tables, numeric)
+    candidates, labels = time_columns(numeric, samples), dict[str, str]()
+    if not period_s and not candidates:
+        labels = label_columns(table)  # of several episodes in a file
     if labels:
-        samples = [samples[0][:, rows] for rows in labelled(table, labels.values())[: RULE.sampled]]
-        signals = _by_column(numeric, samples)
+        episodes = [rows for _, rows in table.stretches(labels.values())][: RULE.sampled]
+        samples = {at: [signals[0][rows] for rows in episodes] for at, signals in samples.items()}
+        candidates = time_columns(numeric, samples)
     known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), dict[str, str]()
     if not period_s:
-        time, keys, notes = _time(source, head, columns, numeric, signals)
+        time, keys, notes = _time(source, head, columns, candidates, samples)
         known[time.at] = replace(time, part=ColumnPart.TIME)
     keys |= {"labels": labels} if labels else {}
     for column in columns:
         if column.header in labels.values():
             known[column.at] = replace(column, why="says which unit, condition or episode a row belongs to")
-    proposed = propose([c for c in numeric if c.at not in known], signals)
+    proposed = propose([c for c in numeric if c.at not in known], samples)
     known = {c.at: c for c in proposed} | known
     return [known.get(c.at, replace(c, why="no numbers")) for c in columns], keys, notes
 
 
-def _by_column(columns: Sequence[TableColumn], samples: Sequence[Array]) -> dict[int, list[Array]]:
-    """Return the signals of every column by its place in the table."""
-    return {c.at: [sample[i] for sample in samples] for i, c in enumerate(columns)}
-
-
-def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[int]) -> tuple[Table, list[Array]]:
-    """Return columns of some tables, (n_columns, n_rows), spread over those that can be read, and the first of these.
-
-    What cannot be used is NaN.
-    """
+def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColumn]) -> tuple[Table, Samples]:
+    """Return the first table that can be read, and columns of some that can; what cannot be used is NaN."""
     spread = tables[:: max(1, len(tables) // RULE.sampled)]
-    samples = dict[Table, Array]()
+    places, samples = [c.at for c in columns], dict[Table, Array]()
     for table in dict.fromkeys((*spread, *tables)):
         if len(samples) == len(spread):
             break
         with suppress(DataError):
-            (values,) = table.numbers(columns)
+            (values,) = table.numbers(places)
             if len(values) >= CHECK.samples:
                 samples[table] = np.where(usable(values), values, np.nan).T
     if not samples:
-        next(tables[0].numbers(columns))  # says why not, where it cannot be read
+        next(tables[0].numbers(places))  # says why not, where it cannot be read
         problem = "the files have fewer than three rows of numbers; check the folder."
         raise DataError(f"Looking at {source}: {problem}")
-    return next(iter(samples)), list(samples.values())
-
-
-def _described(head: TableHead) -> list[TableColumn]:
-    """Return the columns that have a header, or all where there is none, without parts."""
-    described = list[TableColumn]()
-    for i, (header, unit) in enumerate(zip(head.fields, head.units, strict=True)):
-        if header:
-            column = describe(header, unit, [c.name for c in described])
-            alone = head.dialect.header and head.fields.count(header) == 1
-            described.append(replace(column, at=i, header=header if head.dialect.header else str(i + 1), alone=alone))
-    return described
+    return next(iter(samples)), {at: [signals[i] for signals in samples.values()] for i, at in enumerate(places)}
 
 
 def _time(
-    source: Path,
-    head: TableHead,
-    columns: Sequence[TableColumn],
-    numeric: Sequence[TableColumn],
-    signals: dict[int, list[Array]],
+    source: Path, head: TableHead, columns: Sequence[TableColumn], candidates: Sequence[TableColumn], samples: Samples
 ) -> tuple[TableColumn, Record, dict[str, str]]:
     """Return the column of time, the keys of a mapping that describe it, and what they rest on."""
-    candidates, stamps = time_columns(numeric, signals), {c: head.timestamp(c.at) for c in columns}
+    stamps = {c: head.timestamp(c.at) for c in columns}
     texts = [c for c, order in stamps.items() if order is not None]
     if candidates and (not texts or candidates[0].kind == "time"):
         time = candidates[0]
-        scale, why = time_scale(time, float(np.median(np.diff(signals[time.at][0]))))
+        scale, why = time_scale(time, float(np.median(np.diff(samples[time.at][0]))))
         keys: Record = {"time": time.reference} | ({"time_unit": time.recorded} if time.recorded else {})
         return (time, keys, {}) if scale == 1 else (time, keys | {"time_scale": scale}, {"time_scale": why})
     if texts:
@@ -273,7 +243,8 @@ def _examined(
         raise DataError(
             f"Looking at {source}: none of {len(looks)} episodes can be used; {looks[0].key}: {looks[0].wrong}"
         )
-    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]
+    files = _files_of(population, source)
+    findings += [f"left out, {files[key]}: {why}" for key, why in wrong.items()]
     few, shortest = [group for group, n in counts.items() if n < 2], min(s.n_samples for s in good)
     if 2 * len(few) > len(counts) and shortest >= 2 * fewest:
         mapping = mapping | {"pieces": int(np.clip(shortest // RULE.shortest_piece, 2, RULE.pieces))}
@@ -285,19 +256,14 @@ def _examined(
     for unit, condition in few:
         wrong |= dict.fromkeys(population.keys(unit, condition), "the only episode of its unit and condition")
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
-    usable_files = {_relative(population, source, key) for key in population.episodes if key not in wrong}
-    paths = {key: _relative(population, source, key) for key in wrong}
-    unusable = [part_of(path, key) if path in usable_files else path for key, path in paths.items()]
+    retained = {path for key, path in files.items() if key not in wrong}
+    unusable = [part_of(files[key], key) if files[key] in retained else files[key] for key in wrong]
     mapping = mapping | _exclusion([*excluded, *unusable])
-    retained = read_csv_folder(source, mapping)
-    prepare, text = _resampling(population, source, good)
-    reading = _reading(retained, source)
-    return Discovery(mapping, prepare, draft.columns, retained, notes, (*findings, *text), reading)
+    prepare, text = _resampling(files, good)
+    return replace(draft, mapping=mapping, prepare=prepare, notes=notes, findings=(*findings, *text))
 
 
-def _resampling(
-    population: Population, source: Path, looks: Sequence[EpisodeLook]
-) -> tuple[tuple[Record, ...], list[str]]:
+def _resampling(files: Mapping[EpisodeKey, str], looks: Sequence[EpisodeLook]) -> tuple[tuple[Record, ...], list[str]]:
     """Return the step that makes time even or bridges NaN, and a sentence about it; nothing where neither is needed."""
     median, worst = float(np.median([s.period_s for s in looks])), max(looks, key=lambda s: s.uneven)
     period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
@@ -311,7 +277,7 @@ def _resampling(
     text = f"NaN in {bridged} episodes is bridged by straight lines" if even else text
     text += f": all episodes are resampled to a period of {period_s:g} s {recorded}"
     if uneven:
-        where = f"at sample {worst.uneven[1]} of {_relative(population, source, worst.key)}"
+        where = f"at sample {worst.uneven[1]} of {files[worst.key]}"
         text += f", the worst step differs by {worst.uneven[0] * period_s:.3g} s {where}"
     text += f"; where a step is longer than {GAP:g} periods, the longest stretch without such a gap is taken"
     return ({"step": "resample", "period_s": period_s},), [text]
@@ -322,13 +288,14 @@ def _reading(population: Population, source: Path) -> str:
     key, groups = population.episodes[0], sorted({unit.group for unit in population.units if unit.group})
     group = f", group {population.unit(key.unit).group!r} of {some(groups)}" if groups else ""
     parts = f"unit {key.unit!r}, condition {key.condition!r}, episode {key.episode!r}{group}"
-    return f"{_relative(population, source, key)}: {parts}"
+    return f"{_files_of(population, source)[key]}: {parts}"
 
 
 def _exclusion(names: Sequence[str]) -> Record:
     return {"exclude": f"^(?:{'|'.join(quoted(name) for name in dict.fromkeys(names))})$"} if names else {}
 
 
-def _relative(population: Population, source: Path, key: EpisodeKey) -> str:
-    recordings: Any = population.source
-    return Path(recordings.recordings.places[key].table.path).relative_to(source).as_posix()
+def _files_of(population: Population, source: Path) -> dict[EpisodeKey, str]:
+    """Return the file of every episode, relative to the folder."""
+    places = population.source.recordings.places
+    return {key: places[key].table.path.relative_to(source).as_posix() for key in population.episodes}

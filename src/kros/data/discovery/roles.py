@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core import Array, frozen
 from ..measures import KINDS, Measure, clean_unit, measure, split_header
-from ..readers.tables import Table, stretches
+from ..readers.tables import Table
 from ..recording import CHECK
 
 WORDS = {
@@ -36,6 +36,7 @@ WORDS = {
 }
 _OF_WORD = {word: kind for kind, words in WORDS.items() for word in words.split()}
 UNKNOWN = "not recognised"
+Samples = Mapping[int, Sequence[Array]]  # of columns by their place, from several episodes
 _STATES = ("angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration")
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
 _LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
@@ -94,14 +95,21 @@ def identifier(text: str, taken: Collection[str] = ()) -> str:
     return next(n for n in (name, *numbered) if n not in taken)
 
 
-def describe(header: str, unit: str, taken: Collection[str]) -> TableColumn:
-    """Return a column by its header and the unit that a file states elsewhere, without a part."""
-    stem, written = split_header(header)
-    unit = clean_unit(unit) or clean_unit(written)
-    name = header if header.isidentifier() and not written else stem
-    name = identifier(f"column_{name}" if name.isdigit() else name, taken)
-    known = measure(unit) or Measure(unit, 1.0, 0.0)
-    return TableColumn(header, name, known.si, known.factor, known.offset, unit, kind_of(stem, unit))
+def describe(table: Table) -> list[TableColumn]:
+    """Return the columns that have a header, or all where there is none, without parts."""
+    columns = list[TableColumn]()
+    for i, (header, stated) in enumerate(zip(table.fields, table.units, strict=True)):
+        if not header:
+            continue
+        stem, written = split_header(header)
+        unit = clean_unit(stated) or clean_unit(written)
+        name = header if header.isidentifier() and not written else stem
+        name = identifier(f"column_{name}" if name.isdigit() else name, [c.name for c in columns])
+        known = measure(unit) or Measure(unit, 1.0, 0.0)
+        about = known.si, known.factor, known.offset, unit, kind_of(stem, unit)
+        alone = table.dialect.header and table.fields.count(header) == 1
+        columns.append(TableColumn(header, name, *about, at=i, alone=alone))
+    return columns
 
 
 def _kinds_of(name: str) -> list[str]:
@@ -119,12 +127,12 @@ def kind_of(name: str, unit: str = "") -> str:
     return next(quantities, "") if kind == "other" else kind
 
 
-def time_columns(columns: Sequence[TableColumn], signals: Mapping[int, Sequence[Array]]) -> list[TableColumn]:
+def time_columns(columns: Sequence[TableColumn], samples: Samples) -> list[TableColumn]:
     """Return the columns that may be time, the likeliest first: called so, or increasing evenly, in most samples."""
-    rising = [c for c in columns if np.mean([_rises(s) for s in signals[c.at]]) > 0.5]
+    rising = [c for c in columns if np.mean([_rises(s) for s in samples[c.at]]) > 0.5]
     called = [c for c in rising if c.kind == "time"]
-    other = [c for c in rising if c not in called and not all(map(_counts, signals[c.at]))]
-    return called + [c for c in other if all(map(_is_even, signals[c.at]))]
+    other = [c for c in rising if c not in called and not all(map(_counts, samples[c.at]))]
+    return called + [c for c in other if all(map(_is_even, samples[c.at]))]
 
 
 def _rises(column: Array) -> bool:
@@ -151,11 +159,11 @@ def time_scale(column: TableColumn, step: float) -> tuple[float, str]:
     return 1.0, f"a step of {step:g} fits no unit of time: correct time_scale"
 
 
-def propose(columns: Sequence[TableColumn], signals: Mapping[int, Sequence[Array]]) -> list[TableColumn]:
+def propose(columns: Sequence[TableColumn], samples: Samples) -> list[TableColumn]:
     """Return the columns, without that of time, with the part that each is likely to have."""
     proposed = list[TableColumn]()
     for column in columns:
-        spare = _spare(column, signals[column.at])
+        spare = _spare(column, samples[column.at])
         part, why = (ColumnPart.LEFT_OUT, spare) if spare else _by_name(column)
         proposed.append(replace(column, part=part, why=why))
     free = [c.kind for c in proposed if c.part is ColumnPart.STATE]
@@ -193,12 +201,7 @@ def label_columns(table: Table) -> dict[str, str]:
     for field in table.fields:
         words = set(identifier(f"{field} ").lower().split("_"))
         role = next((role for role, known in LABELS.items() if words <= set(known.split())), None)
-        rows = labelled(table, [field]) if role else []
+        rows = [rows for _, rows in table.stretches([field])] if role else []
         if role and 1 < len(rows) < rows[-1].stop / 10:
             labels.setdefault(role, field)
     return labels
-
-
-def labelled(table: Table, labels: Iterable[str]) -> list[slice]:
-    """Return the rows of every episode in a file."""
-    return [rows for _, rows in stretches([table.texts(table.fields.index(field)) for field in labels])]

@@ -8,7 +8,7 @@ place: units before episodes.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain, groupby
 
 from ...core import Names
@@ -98,15 +98,14 @@ def _roles(columns: list[Names], folders: int) -> tuple[Roles, bool]:
         if all(re.fullmatch(p, v) for k, p in enumerate(_DATE_PARTS) for v in columns[i + k]):
             roles = [EPISODE if j in varying and i <= j <= i + 2 else role for j, role in enumerate(roles)]
     for i in varying:  # box1/box1_03
-        if roles[i] is None and any(j < i and columns[i] == columns[j] for j in varying):
+        if roles[i] is None and columns[i] in [columns[j] for j in varying if j < i]:
             roles[i] = "other"
     if UNIT not in roles and varying:  # motor00_01 and motor00_02 are two episodes
         same = [i for i, c in enumerate(columns) if i not in varying and re.search(r"\d", c[0])]
         named = next((i for i in same if _by_words(columns, i) == UNIT), None)
         roles = [UNIT if i == named else role for i, role in enumerate(roles)]
     left = [i for i in varying if roles[i] is None]
-    repeated = [i for i in left if len(set(columns[i])) < len(columns[i])]
-    units = [i for i in varying if roles[i] == UNIT] or repeated
+    units = [i for i in varying if roles[i] == UNIT] or [i for i in left if len(set(columns[i])) < len(columns[i])]
     for i in left:  # good/act1, faulty/act3: two labels, and not two units
         if any(j > i and _nested(columns[i], columns[j]) for j in units):
             roles[i] = GROUP
@@ -116,11 +115,14 @@ def _roles(columns: list[Names], folders: int) -> tuple[Roles, bool]:
     return _contiguous(roles), not left
 
 
+def _numbered(words: Iterable[str]) -> bool:
+    return all(re.search(r"\d", word) for word in words)
+
+
 def _nested(outer: Names, inner: Names) -> bool:
     """Tell whether words without numbers label units: every unit, a numbered word, has one, and a label has several."""
     values, labels = set(inner), set(outer)
-    numbers = [bool(re.search(r"\d", v)) for v in (*values, *labels)]
-    apart = all(numbers[: len(values)]) and not any(numbers[len(values) :])
+    apart = _numbered(values) and not any(_numbered([label]) for label in labels)
     return apart and len(labels) < len(values) == len(set(zip(outer, inner, strict=True)))
 
 
@@ -133,7 +135,7 @@ def _by_words(columns: list[Names], i: int) -> str | None:
         return CONDITION
     plain = {re.sub(r"\d+$", "", v) for v in values}
     before = columns[i - 1][0].lower() if i and len(set(columns[i - 1])) == 1 else ""
-    numbered = plain.pop() if len(plain) == 1 and all(re.search(r"\d", v) for v in values) else ""
+    numbered = plain.pop() if len(plain) == 1 and _numbered(values) else ""
     roles = {_ROLE_OF.get(numbered), _ROLE_OF.get(re.sub(r"s$", "", before))}
     role = next((role for role in _WORDS if role in roles), None)
     return role or (EPISODE if all(_DATE.match(v) for v in columns[i]) else None)
@@ -143,19 +145,18 @@ def _by_place(columns: list[Names], folders: int, varying: Sequence[int], left: 
     """Set the roles that no word tells: units before conditions before episodes."""
     if UNIT not in roles:  # what differs in every file is no machine, unless nothing else differs
         repeated = [i for i in left if len(set(columns[i])) < len(columns[i]) or varying == [i]]
-        numbered = [i for i in repeated if i < folders and all(re.search(r"\d", v) for v in columns[i])]
-        above = [i for i in numbered if EPISODE in roles[i:]]  # hall1/crane1/run1: the folder of a set of runs
+        # hall1/crane1/run1: the folder of a set of runs
+        above = [i for i in repeated if i < folders and _numbered(columns[i]) and EPISODE in roles[i:]]
         for i in (above or repeated[:1])[-1:]:
             roles[i] = UNIT
-    for i in reversed(left):
-        numbers = [bool(re.search(r"\d", v)) for v in columns[i]]
+    for i in reversed([i for i in left if roles[i] is None]):
         before = UNIT in roles[i + 1 :] and not any(roles[i + 1 : roles.index(UNIT, i + 1)])
-        if roles[i] is None and before and all(numbers):  # batch2/motor7: the batch is part of the name
+        labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
+        roles[i] = UNIT if labels else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
+        if before and _numbered(columns[i]):  # batch2/motor7: the batch is part of the name
             roles[i] = UNIT
-        elif roles[i] is None:
-            labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
-            free: str = UNIT if labels and not before else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
-            roles[i] = CONDITION if before and CONDITION not in roles else free
+        elif before:
+            roles[i] = EPISODE if CONDITION in roles else CONDITION
 
 
 def _contiguous(roles: Roles) -> Roles:

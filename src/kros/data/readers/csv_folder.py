@@ -386,6 +386,7 @@ def _places(
         raise DataError(f"Reading {table.path}: {problem}; put the names of the columns first, or set header = false.")
     at = tuple(_position(table, *column) for column in wanted)
     pairs = [_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True)]
+    pairs[:1] = pairs[:1] if mapping.timestamp is None else [(1.0, 0.0)]
     return at, tuple(factor for factor, _ in pairs), tuple(offset for _, offset in pairs)
 
 

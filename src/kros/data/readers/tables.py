@@ -66,9 +66,9 @@ class Table:
             yield values_of(self.path, [self.fields[i] for i in columns])
             return
         waiting = [np.empty((0, len(columns)))]
-        for batch in self._batches(columns, () if timestamp is None else columns[:1]):
-            first = [] if timestamp is None else [microseconds(batch.pop(0), timestamp)]
-            part = np.column_stack([*first, *map(to_numpy, batch)])
+        for time, *others in self._batches(columns, () if timestamp is None else columns[:1]):
+            first = to_numpy(time) if timestamp is None else microseconds(time, timestamp)
+            part = np.column_stack([first, *map(to_numpy, others)])
             if len(part) > 1 and sum(map(len, waiting)) >= rows:
                 yield np.concatenate(waiting)
                 waiting = []

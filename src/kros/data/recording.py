@@ -129,9 +129,7 @@ def estimate_period(recording: Recording) -> float:
     if len(time) < 2:
         need = "the sampling period needs at least two samples with time"
         raise DataError(f"{name}: {need}, found {len(time)}; leave the episode out.")
-    steps = np.diff(time)
-    shortest, longest = (float(f"{step:.6g}") for step in (steps.min(), steps.max()))
-    period = shortest if shortest == longest else float(f"{np.median(steps):.6g}")  # rounding keeps order
+    period = float(f"{np.median(np.diff(time)):.6g}")
     if not period > 0:
         advice = "name the column that holds time, in seconds and increasing"
         raise DataError(f"{name}: the median time step is {period:g} s; {advice}.")

@@ -165,16 +165,13 @@ class Batch(BatchSettings, ABC, Generic[P]):
         inputs = np.stack([self.reference(self.random(INPUT_STREAM, e), n_samples) for e in range(self.n_episodes)])
         states, names = truth.respond(inputs), [c.name for c in self.channels]
         true = states[[names.index(t.of) for t in self.truths]]
-        keys = {
-            EpisodeKey(unit.id, DEFAULT_CONDITION, str(e)): (u, e)
-            for u, unit in enumerate(units)
-            for e in range(self.n_episodes)
-        }
-        for key, at in keys.items():
-            noise = self.random(NOISE_STREAM, int(key.unit), at[1]).standard_normal((len(self.noise), n_samples))
-            states[1 : 1 + len(noise), *at] += np.array(self.noise)[:, None] * noise
         states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
-        parts = {key: (states[:, u, e], inputs[e, None], true[:, u, e]) for key, (u, e) in keys.items()}
+        parts = dict[EpisodeKey, tuple[Array, Array, Array]]()
+        for u, e in np.ndindex(len(units), self.n_episodes):
+            noise = self.random(NOISE_STREAM, int(units[u].id), e).standard_normal((len(self.noise), n_samples))
+            states[1 : 1 + len(noise), u, e] += np.array(self.noise)[:, None] * noise
+            key = EpisodeKey(units[u].id, DEFAULT_CONDITION, str(e))
+            parts[key] = states[:, u, e], inputs[e, None], true[:, u, e]
         columns, about = (*self.channels, *self.truths), {"plant": truth.plant}
         population = assemble(SimulatedEpisodes(parts), columns, units, truth.sample_period_s, about)
         return SimulatedPopulation(population, population, truth)

@@ -48,8 +48,8 @@ class TableHead(Table):
             return None
         import pyarrow as pa
 
-        times = (microseconds(pa.array(cells), order) for order in ORDERS)
-        return next((order for order, values in zip(ORDERS, times, strict=True) if np.isfinite(values).all()), None)
+        stamps = pa.array(cells)
+        return next((order for order in ORDERS if np.isfinite(microseconds(stamps, order)).all()), None)
 
 
 def look_at(path: Path) -> TableHead:

@@ -219,17 +219,17 @@ class Population(Shown):
     @property
     def states(self) -> Names:
         """Names of the states, in column order."""
-        return tuple(c.name for c in self.channels if c.role is Role.STATE)
+        return tuple(c.name for c in self.columns if c.role is Role.STATE)
 
     @property
     def inputs(self) -> Names:
         """Names of the inputs, in column order."""
-        return tuple(c.name for c in self.channels if c.role is Role.INPUT)
+        return tuple(c.name for c in self.columns if c.role is Role.INPUT)
 
     @property
     def measured(self) -> Names:
         """Names of the states that are available at run time."""
-        return tuple(c.name for c in self.channels if c.role is Role.STATE and c.measured)
+        return tuple(c.name for c in self.columns if c.role is Role.STATE and c.measured)
 
     @property
     def true_states(self) -> Columns:

@@ -18,15 +18,13 @@ from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_
 from ..measures import split_header
 from ..population import EpisodeKey, Population, Role
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, part_of, read_csv_folder
-from ..readers.tables import Table
+from ..readers.tables import Table, stretches
 from ..recording import CHECK, some, usable
 from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
 from .roles import UNKNOWN, ColumnPart, Samples, TableColumn, describe, label_columns, propose, time_columns, time_scale
-
-_RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
 
 
 @dataclass(frozen=True)
@@ -52,9 +50,7 @@ class Discovery:
     reading: str = ""  # what the first file was taken for
 
 
-def discover(
-    source: Path, wanted: Wanted | None = None, work: Work | None = None, fewest: int = CHECK.samples
-) -> Discovery:
+def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None, fewest: int = 0) -> Discovery:
     """Describe a folder of tables; an episode needs at least the `fewest` samples."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
@@ -68,15 +64,16 @@ def discover(
     mapping |= head.dialect.model_dump(exclude_defaults=True)
     columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
     columns = _decided(columns, wanted)
-    mapping |= {**keys, "channel": [_channel(c) for c in columns if c.part in _RECORDED]}
+    recorded = (c for c in columns if c.part not in (ColumnPart.TIME, ColumnPart.LEFT_OUT))
+    mapping |= {**keys, "channel": [_channel(c) for c in recorded]}
     damaged = dict[str, str]()
     population = read_csv_folder(source, mapping | _exclusion(list(strange)), damaged=damaged)
-    draft = Discovery(mapping, (), tuple(columns), population, notes)
     alone = f"{len(strange)} files are not like the others and left alone: {some(list(strange))}"
     findings = [f"{alone}; the first {next(iter(strange.values()))}"] if strange else []
     findings += [f"left out, {name}: {why}" for name, why in damaged.items()]
     unused = [name for name in (*strange, *damaged) if re.search(mapping["files"], name)]
-    found = _examined(source, draft, findings, unused, fewest, work)
+    draft = Discovery(mapping, (), tuple(columns), population, notes, tuple(findings))
+    found = _examined(source, draft, unused, fewest, work)
     retained = read_csv_folder(source, found.mapping)
     return replace(found, population=retained, reading=_reading(retained, source))
 
@@ -135,7 +132,8 @@ def _columns(
     if not period_s and not candidates:
         labels = label_columns(table)  # of several episodes in a file
     if labels:
-        episodes = [rows for _, rows in table.stretches(labels.values())][: RULE.sampled]
+        texts = [table.texts(table.fields.index(label)) for label in labels.values()]
+        episodes = [rows for _, rows in stretches(texts)][: RULE.sampled]
         samples = {at: [signals[0][rows] for rows in episodes] for at, signals in samples.items()}
         candidates = time_columns(numeric, samples)
     known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), dict[str, str]()
@@ -231,11 +229,9 @@ def _place(columns: Sequence[TableColumn], name: str) -> int:
     raise ConfigError(f"Roles: there is no column {name!r}{hint} The columns are {', '.join(names)}.")
 
 
-def _examined(
-    source: Path, draft: Discovery, findings: list[str], excluded: Sequence[str], fewest: int, work: Work | None
-) -> Discovery:
+def _examined(source: Path, draft: Discovery, excluded: Sequence[str], fewest: int, work: Work | None) -> Discovery:
     """Look at every episode, leave out what cannot be used, and complete the description."""
-    population, mapping, notes = draft.population, draft.mapping, dict(draft.notes)
+    population, mapping, notes, findings = draft.population, draft.mapping, dict(draft.notes), [*draft.findings]
     looks = examine(population, fewest, work or Work())
     wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
     counts = Counter((s.key.unit, s.key.condition) for s in good)

@@ -1,8 +1,7 @@
 """Unit, condition, episode and group from the names of files, as a regular expression on their paths.
 
-A path is cut into words at ``/ _ - .`` and spaces. What is the same in all paths is text; what differs is told apart
-by the word that it begins with or that stands before it (``run_3``), by what conditions are called, and else by its
-place: units before episodes.
+A path is cut into words. What differs between paths is told apart by the word that it begins with or that stands before
+it (``run_3``), by what conditions are called, and else by its place: units before episodes.
 """
 
 from __future__ import annotations
@@ -40,10 +39,7 @@ Cut = list[list[str]]  # words of every path, with what is between them
 
 
 def infer_names(paths: Sequence[str]) -> tuple[str, str | None]:
-    """Return the expression with the groups `unit`, `condition`, ... that tells files apart, and one that does as well.
-
-    The second takes units for episodes of one unit, where names do not say which they are.
-    """
+    """Return the expression that tells files apart, and one for episodes of one unit where names do not say which."""
     ends = [next((ending for ending in ENDINGS if p.lower().endswith(ending)), "") for p in paths]
     stems = [p[: len(p) - len(ending)] for p, ending in zip(paths, ends, strict=True)]
     endings = sorted({re.escape(p[len(stem) :]) for p, stem in zip(paths, stems, strict=True)})

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core import Array, frozen
 from ..measures import KINDS, Measure, clean_unit, measure, split_header
-from ..readers.tables import Table
+from ..readers.tables import Table, stretches
 from ..recording import CHECK
 
 WORDS = {
@@ -201,7 +201,7 @@ def label_columns(table: Table) -> dict[str, str]:
     for field in table.fields:
         words = set(identifier(f"{field} ").lower().split("_"))
         role = next((role for role, known in LABELS.items() if words <= set(known.split())), None)
-        rows = [rows for _, rows in table.stretches([field])] if role else []
+        rows = [rows for _, rows in stretches([table.texts(table.fields.index(field))])] if role else []
         if role and 1 < len(rows) < rows[-1].stop / 10:
             labels.setdefault(role, field)
     return labels

@@ -214,9 +214,9 @@ def from_frame(
             raise DataError(f"from_frame: column {name!r} occurs {known.count(name)} times in {known}; rename it.")
     numbers = np.column_stack([_column(frame, c.name) for c in ordered])
     times = None if time is None else _column(frame, time)
-    columns: list[tuple[str | None, str | None]] = [(unit, None), (condition, DEFAULT_CONDITION), (episode, "0")]
+    ids = _ids(frame, unit, None), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0")
     rows: dict[EpisodeKey, list[int]] = {}  # they need not stand together
-    for row, key in enumerate(map(EpisodeKey, *(_ids(frame, *column) for column in columns))):
+    for row, key in enumerate(map(EpisodeKey, *ids)):
         rows.setdefault(key, []).append(row)
     places = {key: (numbers[at], None if times is None else times[at]) for key, at in rows.items()}
     return assemble(ArrayRecordings(places), ordered, sample_period_s=sample_period_s)

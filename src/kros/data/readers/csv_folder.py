@@ -19,7 +19,7 @@ from ...core import Array, ByName, Columns, DataError, Names, Record, Settings, 
 from ..measures import clean_unit, measure, split_header
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps
-from ..recording import Recording, Recordings, check_names, some, usable
+from ..recording import Recording, Recordings, some, usable
 from ..steps import STEPS, Scale, Step
 from .formats import FORMATS
 from .tables import TIMESTAMP_SCALE, Dialect, Table, stretches
@@ -281,23 +281,26 @@ def read_csv_folder(
             if key in places:
                 twice = f"{key} is in {places[key].table.path} and in {path}"
                 raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
-            check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
             places[key], group = place, named.get("group", "")
             if groups.setdefault(key.unit, group) != group:
                 both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
                 raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
     if not places:
-        files, endings = [relative for _, relative in csv_files(source)], ", ".join(ENDINGS[:4])
-        sample = f" of {len(files)} files such as {files[0]!r}" if files else ""
-        left_out = f" without exclude = {chosen.exclude!r}" if chosen.exclude else ""
-        none = sample or f"; there is no file that ends in {endings}"
-        actual = f"no file matches files = {chosen.files!r}{left_out}{none}"
-        raise DataError(f"Reading {source} as csv: {actual}; correct the expression.")
+        raise _nothing(source, chosen)
     time_scale = None if chosen.time is None else chosen.time_scale
     recordings = CsvRecordings(places, time_scale, chosen.timestamp)
     channels = tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in chosen.ordered)
     facts = ([Unit(unit, group) for unit, group in groups.items()], chosen.sample_period_s, chosen.metadata)
     return assemble(recordings, channels, *facts, steps=chosen.steps, scaling=chosen.scaling)
+
+
+def _nothing(source: Path, mapping: CsvMapping) -> DataError:
+    """Return why a folder has no episodes."""
+    files, left_out = [name for _, name in csv_files(source)], " and not exclude" if mapping.exclude else ""
+    none = f"; there is no file that ends in {', '.join(ENDINGS[:4])}"
+    sample = f" of {len(files)} files such as {files[0]!r}" if files else none
+    actual = f"no file matches files = {mapping.files!r}{left_out}{sample}"
+    return DataError(f"Reading {source} as csv: {actual}; correct the expression.")
 
 
 def part_of(path: str, key: EpisodeKey) -> str:

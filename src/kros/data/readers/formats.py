@@ -1,7 +1,6 @@
 """Recordings in the files of measurement programs, each as tables of columns that share their samples.
 
-A format is a function that yields signals by name, nested as in the file, and their units of measure; `FORMATS` names
-it, and the extra that installs what it needs, by the end of a file's name. Text is read in blocks, by `tables`.
+A format is a function that yields signals by name, nested as in the file, and their units of measure.
 """
 
 from __future__ import annotations
@@ -104,6 +103,7 @@ def _arrow(path: Path) -> Iterator[Group]:
     yield {name: s.astype(str) if s.dtype == object else s for name, s in signals.items()}, units
 
 
+# by the end of a file's name, with the extra that installs what it needs
 FORMATS: dict[str, tuple[Callable[[Path], Iterator[Group]], str]] = {
     ".mat": (_matlab, "mat73"),
     **dict.fromkeys((".parquet", ".feather"), (_arrow, "")),

@@ -49,10 +49,7 @@ EPISODE = r"[^/]*(?=\d{3}\.csv$)0{0,2}(?P<episode>\d{1,3})\.csv"  # the last thr
 MAPPING = CsvMapping(
     files=f"^(?P<group>{'|'.join(GROUPS)})/{FOLDER}/{EPISODE}$",
     time=1,
-    channel=tuple(
-        ChannelMapping(name=c.name, role=c.role, unit=c.unit, measured=c.measured, column=number)
-        for number, c in enumerate(CHANNELS, start=2)
-    ),
+    channel=tuple(ChannelMapping(**vars(c), column=number) for number, c in enumerate(CHANNELS, start=2)),
     prepare=STEPS,
     metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
 )

@@ -7,7 +7,7 @@ import csv
 import gzip
 import re
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
@@ -80,10 +80,6 @@ class Table:
         if is_binary(self.path):
             return texts_of(self.path, self.fields[column])
         return [str(text).strip() for (texts,) in self._batches([column], [column]) for text in texts.to_pylist()]
-
-    def stretches(self, labels: Iterable[str]) -> Iterator[tuple[tuple[str, ...], slice]]:
-        """Yield what columns hold where they stay the same, and these rows."""
-        return stretches([self.texts(self.fields.index(label)) for label in labels])
 
     def _batches(self, wanted: Sequence[int], texts: Collection[int]) -> Iterator[list[Any]]:
         """Yield columns as Arrow arrays of numbers, or of texts."""

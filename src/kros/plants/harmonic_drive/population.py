@@ -90,7 +90,7 @@ def _draw_checkpoints(rng: np.random.Generator, n_samples: int) -> Array:
 
 
 def _candidates(rng: np.random.Generator, n_moves: int) -> Array:
-    """Draw sequences of checkpoints, neighbours so far apart that full speed is reached, (n_candidates, n_moves + 1)."""
+    """Draw checkpoints, so far apart that full speed is reached, shape (n_candidates, n_moves + 1)."""
     drawn, shortest = np.empty((_CANDIDATES, n_moves + 1)), _RAMPS * MAX_SPEED * SAMPLE_PERIOD_S
     drawn[:, 0] = rng.uniform(-REVOLUTION, REVOLUTION, _CANDIDATES)
     for j in range(n_moves):

@@ -284,7 +284,10 @@ def test_time_is_converted_file_by_file_as_other_columns_are(tmp_path: Path) -> 
     assert [len(one.read(key)) for key in one.episodes] == [N, N]
     with pytest.raises(DataError, match=r"cold_2\.csv: column 't' is in 'ms', and in another file in 's'"):
         read_csv_folder(tmp_path, mapping(unit_rows=1))
-    with pytest.raises(DataError, match=r"column 't' is in 's', and declared in 'rad'"):
+    for name, unit in (("a/cold_1.csv", "seconds"), ("a/cold_2.csv", "s")):  # one unit, in two spellings
+        write(tmp_path / name, plain + np.array([0, len(unit), 0]), f"t,pos,volt\n{unit},counts,V")
+    assert read_csv_folder(tmp_path, mapping(unit_rows=1)).sample_period_s == 0.01
+    with pytest.raises(DataError, match=r"column 't' is in 's.*', and declared in 'rad'"):
         read_csv_folder(tmp_path, mapping(time_unit="rad", unit_rows=1))
 
 

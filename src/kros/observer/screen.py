@@ -29,8 +29,7 @@ from typing import Any
 import numpy as np
 
 from ..core import DataError, DimensionError, shortened
-from ..core.arrays import Array, ArrayLike, Bits, Flags, Index, frozen
-from ..data.readers.arrays import as_numbers
+from ..core.arrays import Array, ArrayLike, Bits, Flags, Index, as_numbers, frozen
 from .data import ObserverData
 from .runtime import Seen
 

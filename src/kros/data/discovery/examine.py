@@ -85,8 +85,7 @@ def _look(population: Population) -> list[EpisodeLook]:
                 far = min(100, len(time) // 2)  # steps at once: single ones may be rounded
                 period = float(np.median(time[far:] - time[:-far])) / far
                 deviation = np.abs(np.diff(time) / period - 1)
-            there = recording.usable(period)
-            start, stop = longest_stretch(np.zeros(0) if there.time_s is None else there.time_s, GAP * period)
+            start, stop = longest_stretch(np.asarray(recording.usable(period).time_s), GAP * period)
             look = EpisodeLook(key, "", stop - start, period, (float(deviation.max()), int(deviation.argmax())))
             check_episode(values, key, population.columns)
             looks[key] = replace(look, digest=digest_of(values))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...core import Array, ByName, DataError, frozen, shortened
+from ...core.arrays import as_numbers
 from ..population import DEFAULT_CONDITION, Channel, Channels, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_period, check_structure, title
@@ -105,18 +106,6 @@ def from_arrays(
     check_structure(columns, [key for key, _ in episodes])  # 1 and "1" are one unit
     places = {key: (np.ascontiguousarray(_samples(key, one, declared)[:, order]), None) for key, one in episodes}
     return assemble(ArrayRecordings(places), columns, units, sample_period_s, metadata)
-
-
-def as_numbers(values: Any) -> Array:
-    """Return an array of doubles, NaN for what is masked; text, complex numbers and dates are refused."""
-    parts = values if isinstance(values, list | tuple) else [values]
-    masked = any(isinstance(part, np.ma.MaskedArray) for part in parts)
-    array = np.ma.asarray(values) if masked else np.asarray(values)
-    kind = array.dtype.kind
-    mixed = kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in array.ravel().tolist())
-    if mixed or kind not in "biufO":
-        raise TypeError(f"{'text or complex' if mixed else array.dtype} cannot be used as real numbers")
-    return np.ma.filled(array.astype(float, copy=False), np.nan)
 
 
 def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:

@@ -400,7 +400,9 @@ def _conversion(table: Table, at: int, column: Column, declared: str, known: dic
     if not stated or clean_unit(usual) == stated:
         return 1.0, 0.0
     ours, theirs = measure(usual), measure(stated)
-    if ours is None or theirs is None or ours.si != theirs.si or not (declared or ours == theirs):
+    if not declared and (None in (ours, theirs) or ours == theirs):
+        return 1.0, 0.0
+    if not declared or ours is None or theirs is None or ours.si != theirs.si:
         problem = (
             f"column {column!r} is in {stated!r}, and {'declared' if declared else 'in another file'} in {usual!r}"
         )

@@ -231,7 +231,7 @@ def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], fi
             f"above {limits.MAX_VALUE:g}": ~usable(signal) & np.isfinite(signal),
             "infinity": np.isinf(signal),
         }
-        bad = np.flatnonzero(np.any(list(kinds.values()), axis=0))
+        bad = np.flatnonzero(~usable(signal))
         if bad.size:
             what = " and ".join(kind for kind, places in kinds.items() if places.any())
             where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"

@@ -188,10 +188,10 @@ def _time(
 
 def _channel(column: TableColumn) -> Record:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
-    role, measured = "input" if column.part is ColumnPart.INPUT else "state", column.part is ColumnPart.MEASURED
+    role, measured = Role.INPUT if column.part is ColumnPart.INPUT else Role.STATE, column.part is ColumnPart.MEASURED
     named = {} if column.reference == column.name else {"column": column.reference}
     about = {"unit": column.unit, "column_unit": column.recorded, "scale": column.scale, "offset": column.offset}
-    channel = ChannelMapping(name=column.name, role=Role(role), measured=measured, **named, **about)
+    channel = ChannelMapping(name=column.name, role=role, measured=measured, **named, **about)
     return channel.model_dump(mode="json", exclude_defaults=True)
 
 

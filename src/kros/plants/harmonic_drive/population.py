@@ -199,11 +199,12 @@ class HarmonicDrivePopulation(BatchSettings):
         inputs = [np.stack(episode_reference(self.seed, e, samples, REST_SAMPLES)) for e in range(self.n_episodes)]
         position, velocity = np.stack(inputs, axis=1)
         states, true, torque = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
+        parts = dict[EpisodeKey, tuple[Array, Array, Array]]()
         for i, key in enumerate(keys):  # what the recording adds: an offset of the position, noise on the current
             rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
             states[i, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
             states[i, 2] += CURRENT_NOISE * rng.standard_normal(states.shape[-1])
-        parts = {key: (states[i], inputs[episode[i]], true[i]) for i, key in enumerate(keys)}
+            parts[key] = states[i], inputs[episode[i]], true[i]
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}

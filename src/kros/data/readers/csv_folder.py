@@ -296,10 +296,10 @@ def read_csv_folder(
 
 def _nothing(source: Path, mapping: CsvMapping) -> DataError:
     """Return why a folder has no episodes."""
-    files, left_out = [name for _, name in csv_files(source)], " and not exclude" if mapping.exclude else ""
+    files, left_out = [name for _, name in csv_files(source)], "; exclude leaves some out" if mapping.exclude else ""
     none = f"; there is no file that ends in {', '.join(ENDINGS[:4])}"
     sample = f" of {len(files)} files such as {files[0]!r}" if files else none
-    actual = f"no file matches files = {mapping.files!r}{left_out}{sample}"
+    actual = f"no file matches files = {mapping.files!r}{sample}{left_out}"
     return DataError(f"Reading {source} as csv: {actual}; correct the expression.")
 
 

@@ -64,10 +64,14 @@ def load_observer(
     lengths = visible.lengths
     recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
     lag = settings.level_s / batch.sample_period_s
-    bank = {"dense": settings.delays, "longest": settings.delays}
-    lags = {"first_lag": lag, "last_lag": lag / recordings.length}
-    restarts = dict.fromkeys(("restart_share", "settled_share"), settings.restart_share)
-    estimator = EstimatorSettings(**bank, **lags, **restarts)
+    estimator = EstimatorSettings(
+        dense=settings.delays,
+        longest=settings.delays,
+        first_lag=lag,
+        last_lag=lag / recordings.length,
+        restart_share=settings.restart_share,
+        settled_share=settings.restart_share,
+    )
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     result = identify_estimator(
         name, with_load, tuple(measured), inputs, recordings, batch.sample_period_s, None, estimator

@@ -84,7 +84,7 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
         selects = re.compile(expression or "").search
     except re.error as error:
         raise ConfigError(f"--files {expression!r}: is not a regular expression ({error}); correct it.") from error
-    files = {relative: path for path, relative in csv_files(source)}
+    files = csv_files(source)
     selected = {relative: path for relative, path in files.items() if selects(relative)}
     if not selected:
         problem = f"none of {len(files)} files of recordings matches --files {expression!r}; correct the expression"

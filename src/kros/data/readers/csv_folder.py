@@ -262,7 +262,6 @@ def read_csv_folder(
     dialect, places = chosen.dialect, dict[EpisodeKey, FilePlace]()
     groups, units_of_measure = dict[str, str](), dict[Column, str]()
     for path, match in _matches(source, chosen):
-        relative = path.relative_to(source).as_posix()
         named = {name: text for name, text in match.groupdict().items() if text}
         try:
             table = Table.open(path, dialect, chosen.declared)
@@ -272,10 +271,10 @@ def read_csv_folder(
         except DataError as error:
             if damaged is None:
                 raise
-            damaged[relative] = str(error)
+            damaged[match.string] = str(error)
             continue
         for key, place in episodes:
-            part = part_of(relative, key)
+            part = part_of(match.string, key)
             if place.rows != slice(None) and chosen.exclude and re.search(chosen.exclude, part):
                 continue
             if key in places:
@@ -296,7 +295,7 @@ def read_csv_folder(
 
 def _nothing(source: Path, mapping: CsvMapping) -> DataError:
     """Return why a folder has no episodes."""
-    files, left_out = [name for _, name in csv_files(source)], "; exclude leaves some out" if mapping.exclude else ""
+    files, left_out = list(csv_files(source)), "; exclude leaves some out" if mapping.exclude else ""
     none = f"; there is no file that ends in {', '.join(ENDINGS[:4])}"
     sample = f" of {len(files)} files such as {files[0]!r}" if files else none
     actual = f"no file matches files = {mapping.files!r}{sample}{left_out}"
@@ -351,20 +350,22 @@ def _absent(mapping: CsvMapping, fields: Names, optional: Collection[str]) -> se
     return absent | {c.name for c in mapping.channel if c.truth_of in absent}
 
 
-def csv_files(source: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the tables below a folder with their relative paths, in order."""
+def csv_files(source: Path) -> dict[str, Path]:
+    """Return the tables below a folder by their relative paths, in order."""
+    files = dict[str, Path]()
     for folder, folders, names in os.walk(source):
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for name in sorted(names):
             if name.lower().endswith(ENDINGS) and not name.startswith("."):
                 path = Path(folder) / name
-                yield path, path.relative_to(source).as_posix()
+                files[path.relative_to(source).as_posix()] = path
+    return files
 
 
 def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match[str]]]:
     """Yield the files that the mapping describes; the others are counted and named."""
     others = []
-    for path, relative in csv_files(source):
+    for relative, path in csv_files(source).items():
         if mapping.exclude and re.search(mapping.exclude, relative):
             continue
         match = re.search(mapping.files, relative)

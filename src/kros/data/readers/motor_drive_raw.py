@@ -77,7 +77,7 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     if root is None:
         missing = "found no folder 'population' or 'outliers', nor 'batch_b' with one of them"
         raise DataError(f"{what}: {missing}; check the path, or set another data.reader.")
-    files = [name for _, name in csv_files(root) if name.endswith(".csv") and name.startswith(GROUPS)]
+    files = [name for name in csv_files(root) if name.endswith(".csv") and name.startswith(GROUPS)]
     strange = next((name for name in files if not re.search(MAPPING.files, name)), None)
     if strange is not None:
         wanted = "<YYYYmmddTHHMMSS>_<serial, 6 digits>_<load|noload>/*_<episode, 3 digits>.csv"

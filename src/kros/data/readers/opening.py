@@ -24,7 +24,7 @@ def detect_reader(source: Path | str) -> str | None:
         return "parquet"
     if is_raw_layout(source):
         return "motor-drive-raw"
-    return "csv" if any(True for _ in csv_files(source)) else None
+    return "csv" if csv_files(source) else None
 
 
 def read(

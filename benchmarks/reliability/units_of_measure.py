@@ -71,7 +71,7 @@ def in_units(population: Population, factors: Factors) -> Population:
     return replace(
         population,
         source=Multiplied(population.source, np.array([factors.get(c.name, 1.0) for c in population.channels])),
-        truths=(),
+        columns=population.channels,
     )
 
 

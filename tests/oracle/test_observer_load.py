@@ -133,10 +133,10 @@ def test_calibration_says_what_it_misses(drives: SimpleNamespace) -> None:
     known, lifting = drives.known, Lifting(("position", "velocity", "current"))
     batch = batch_of(known.x, known.u, DT)
     with pytest.raises(DataError, match="with and without load"):
-        load_observer("load", lifting, (0,), ("u",), batch, 0 * known.load)
+        load_observer("load", lifting, (0,), ("u",), batch, 0 * known.load, LoadSettings(current=2))
     with pytest.raises(DataError, match="come to the current's limit"):
         load_observer("load", lifting, (0,), ("u",), batch, known.load, LoadSettings(current=2, limit=0.1))
     with pytest.raises(DimensionError, match="agree"):
-        load_observer("load", lifting, (0,), ("u",), batch, known.load[:-1])
+        load_observer("load", lifting, (0,), ("u",), batch, known.load[:-1], LoadSettings(current=2))
     with pytest.raises(DataError, match="0 of"):
         load_accuracy(known.load, 0 * known.load, DT)

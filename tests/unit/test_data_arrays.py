@@ -127,3 +127,22 @@ def test_frame_refuses() -> None:
         from_frame(values(0), CHANNELS, time="t")
     with pytest.raises(DataError, match="population is empty"):
         from_frame(pd.DataFrame(columns=["unit", "x", "v", "u"]), CHANNELS, sample_period_s=0.1)
+
+
+def test_names_that_are_alike_as_text_are_refused() -> None:
+    with pytest.raises(DataError, match=r"Duplicate episodes: episode 0 of unit 1 \(default\) occurs 2 times"):
+        from_arrays({1: [values(0)], "1": [values(1)]}, CHANNELS, 0.1)
+    assert from_arrays({1: [values(0)]}, CHANNELS, np.float32(0.5)).sample_period_s == 0.5
+
+
+def test_masked_samples_are_missing() -> None:
+    whole = np.ma.masked_array(values(0), np.arange(36).reshape(12, 3) == 13)  # v at sample 4
+    for episode in (
+        whole,
+        [*whole],
+        (whole[:, :2], whole[:, 2:]),
+        {c.name: whole[:, i] for i, c in enumerate(CHANNELS)},
+    ):
+        population = from_arrays({"a": [episode]}, CHANNELS, 0.1)
+        with pytest.raises(DataError, match="channel 'v' has 1 NaN at sample 4"):
+            population.read(population.episodes[0])

@@ -75,7 +75,7 @@ def test_population_of_two_passes_and_one_does_not() -> None:
 
 def test_nothing_measured() -> None:
     with pytest.raises(DataError, match=r"No state of \['x', 'v'\] is measured"):
-        check_population(replace(population(), channels=(replace(CHANNELS[0], measured=False), *CHANNELS[1:])))
+        check_population(replace(population(), columns=(replace(CHANNELS[0], measured=False), *CHANNELS[1:])))
 
 
 def test_empty_and_duplicate() -> None:

@@ -173,7 +173,7 @@ def test_another_rate(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"file": "x"}, r"file: unknown key; did you mean 'files'\? known are files, channel, time"),
+        ({"file": "x"}, r"file: unknown key; did you mean 'files'\? known are .*files, channel, time"),
         (
             {"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]},
             r"channel\.0\.measurd: unknown key; did you mean 'measured'\? .* scale, offset, of\.",
@@ -273,3 +273,28 @@ def test_a_long_file_is_read_in_blocks_as_it_is_read_whole(
     assert len(blocks) > 4
     np.testing.assert_allclose(population.read(key) * [1000, 1], values[:, 1:], rtol=1e-9)  # mm are read as m
     np.testing.assert_array_equal(np.concatenate(blocks), population.read(key))
+
+
+def test_time_is_converted_file_by_file_as_other_columns_are(tmp_path: Path) -> None:
+    plain = samples(0)
+    for name, unit, factor in (("a/cold_1.csv", "s", 1.0), ("a/cold_2.csv", "ms", 1e3)):
+        write(tmp_path / name, (plain + np.array([0, factor, 0])) * [factor, 1, 1], f"t,pos,volt\n{unit},mm,V")
+    one = read_csv_folder(tmp_path, mapping(time_unit="s", unit_rows=1))
+    assert one.sample_period_s == 0.01
+    assert [len(one.read(key)) for key in one.episodes] == [N, N]
+    with pytest.raises(DataError, match=r"cold_2\.csv: column 't' is in 'ms', and in another file in 's'"):
+        read_csv_folder(tmp_path, mapping(unit_rows=1))
+    for name, unit in (("a/cold_1.csv", "seconds"), ("a/cold_2.csv", "s")):  # one unit, in two spellings
+        write(tmp_path / name, plain + np.array([0, len(unit), 0]), f"t,pos,volt\n{unit},counts,V")
+    assert read_csv_folder(tmp_path, mapping(unit_rows=1)).sample_period_s == 0.01
+    with pytest.raises(DataError, match=r"column 't' is in 's.*', and declared in 'rad'"):
+        read_csv_folder(tmp_path, mapping(time_unit="rad", unit_rows=1))
+
+
+def test_a_damaged_first_file_gives_no_period_and_spoils_no_other(folder: Path) -> None:
+    (folder / "a/cold_1.csv").write_text("t,pos,volt\n0.0,1,2\n0.01,1\n")
+    population = read_csv_folder(folder, MAPPING)
+    assert population.sample_period_s == 0.01
+    with pytest.raises(DataError, match=r"cold_1\.csv: CSV parse error"):
+        population.read(population.episodes[0])
+    assert population.read(population.episodes[1]).shape == (N, 2)

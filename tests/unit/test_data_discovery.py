@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data.discovery.dialect import look_at
-from kros.data.discovery.discover import discover
+from kros.data.discovery.discover import Wanted, discover
 from kros.data.discovery.filenames import infer_names
 from kros.data.discovery.roles import TableColumn, identifier, kind_of, time_scale
 from kros.data.measures import split_header
@@ -43,32 +44,39 @@ def names(template: str, **other: object) -> list[str]:
 )
 def test_names_of_files(template, first):
     paths = names(template)
-    found = infer_names(paths)
-    groups = re.search(found.pattern, paths[0])
+    pattern, _ = infer_names(paths)
+    groups = re.search(pattern, paths[0])
     assert groups is not None
     assert tuple(groups.groupdict().get(g) for g in ("unit", "condition", "episode")) == first
-    assert len({tuple(m.groupdict().items()) for p in paths if (m := re.search(found.pattern, p))}) == len(paths)
+    assert len({tuple(m.groupdict().items()) for p in paths if (m := re.search(pattern, p))}) == len(paths)
 
 
 def test_conditions_groups_and_single_machines():
-    assert "(?P<condition>" in infer_names([f"rig{u}_{p}bar.csv" for u in UNITS for p in (3, 5)]).pattern
+    assert "(?P<condition>" in infer_names([f"rig{u}_{p}bar.csv" for u in UNITS for p in (3, 5)])[0]
     assert (
         "(?P<group>"
-        in infer_names([f"{'outliers' if u == 3 else 'good'}/m{u}_{e}.csv" for u in UNITS for e in EPISODES]).pattern
+        in infer_names([f"{'outliers' if u == 3 else 'good'}/m{u}_{e}.csv" for u in UNITS for e in EPISODES])[0]
     )
-    batches = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
-    assert re.search(batches.pattern, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
+    batches, _ = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
+    assert re.search(batches, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
     seals = ["K_N_1bar.csv", "K_N_3bar.csv", "NAP310_1bar.csv", "NAP310_3bar.csv", "rig__O-ring257_1bar.csv"]
-    found = [re.search(infer_names(seals).pattern, name).groupdict() for name in seals]
+    found = [re.search(infer_names(seals)[0], name).groupdict() for name in seals]
     assert [(m["unit"], m["condition"]) for m in found][1:] == [
         ("K_N", "3bar"),
         ("NAP310", "1bar"),
         ("NAP310", "3bar"),
         ("rig__O-ring257", "1bar"),
     ]
-    single = infer_names([f"qube_20240101T12{e}{e}00_43{e}_7{e}.csv" for e in EPISODES])
-    assert "(?P<unit>" not in single.pattern
-    assert infer_names(["only.csv"]).pattern == r"^only\.csv$"
+    halls, _ = infer_names([f"hall{h}/crane{u:02d}/run{e}.csv" for h in (1, 2) for u in UNITS for e in EPISODES])
+    assert re.search(halls, "hall1/crane02/run3.csv").groupdict() == {
+        "unit": "hall1/crane02",
+        "episode": "run3",
+    }
+    days, _ = infer_names([f"pump{u}/day{d}/run{e}.csv" for u in UNITS for d in (1, 2) for e in EPISODES])
+    assert re.search(days, "pump2/day1/run3.csv").groupdict() == {"unit": "pump2", "episode": "day1/run3"}
+    single, _ = infer_names([f"qube_20240101T12{e}{e}00_43{e}_7{e}.csv" for e in EPISODES])
+    assert "(?P<unit>" not in single
+    assert infer_names(["only.csv"])[0] == r"^only\.csv$"
 
 
 @pytest.mark.parametrize(
@@ -112,12 +120,12 @@ def test_conditions_groups_and_single_machines():
     ],
 )
 def test_hostile_layouts_are_read_as_people_do_or_asked_about(paths, first, units, ambiguous):
-    found = infer_names(sorted(set(paths), key=paths.index))
-    groups = [re.search(found.pattern, p).groupdict() for p in paths]
+    pattern, other = infer_names(sorted(set(paths), key=paths.index))
+    groups = [re.search(pattern, p).groupdict() for p in paths]
     assert tuple(groups[0].get(g) for g in ("group", "unit", "condition", "episode")) == first
     assert len({g.get("unit") for g in groups}) == units
-    assert (found.other is not None) == ambiguous
-    assert found.other is None or len({re.search(found.other, p)["episode"] for p in paths}) == units
+    assert (other is not None) == ambiguous
+    assert other is None or len({re.search(other, p)["episode"] for p in paths}) == units
 
 
 @pytest.mark.parametrize(
@@ -181,6 +189,75 @@ def test_lines_before_the_numbers(tmp_path: Path):
     path.write_text("once upon a time\nthere was; a table\n")
     with pytest.raises(DataError, match=r"a\.csv: no rows of numbers were found in its first 2 lines"):
         look_at(path)
+
+
+def recordings(rows: int = 120, episodes: Sequence[int] = (1, 2, 3)) -> dict[str, list[str]]:
+    """Lines of files of two units with a row of units of measure, which `written` writes."""
+    rng, files = np.random.default_rng(0), dict[str, list[str]]()
+    for name in (f"motor{u}/run{e}.csv" for u in (1, 2) for e in episodes):
+        table = np.column_stack([0.01 * np.arange(rows), rng.normal(size=(rows, 3))])
+        files[name] = ["time,angle,speed,voltage", "s,rad,rad/s,V", *(",".join(map(str, r)) for r in table.tolist())]
+    return files
+
+
+def written(folder: Path, files: dict[str, list[str]]) -> Path:
+    for name, lines in files.items():
+        (folder / name).parent.mkdir(exist_ok=True, parents=True)
+        (folder / name).write_text("\n".join(lines))
+    return folder
+
+
+@pytest.mark.parametrize("place", [0, 3])
+def test_damage_costs_one_file_wherever_it_is(tmp_path: Path, place: int):
+    files = recordings()
+    name = list(files)[place]
+    files[name][50] = "0.48,1.0"
+    found = discover(written(tmp_path, files))
+    assert len(found.population.episodes) == 5
+    assert [text.partition(": ")[0] for text in found.findings] == [f"left out, {name}"]
+
+
+@pytest.mark.parametrize("place", [0, 3])
+def test_time_in_other_units_is_converted_where_a_file_says_so_and_refused_where_it_does_not(
+    tmp_path: Path, place: int
+):
+    files = recordings()
+    name = list(files)[place]
+    milliseconds = [f"{1e3 * float(t)},{rest}" for t, _, rest in (line.partition(",") for line in files[name][2:])]
+    files[name][2:] = milliseconds
+    found = discover(written(tmp_path, files))
+    assert len(found.population.episodes) == 5
+    assert f"left out, {name}: its sampling period is 10 s, that of most is 0.01 s" in found.findings[0]
+    files[name][1] = "ms,rad,rad/s,V"
+    found = discover(written(tmp_path, files))
+    assert (len(found.population.episodes), found.findings, found.prepare) == (6, (), ())
+    assert found.population.sample_period_s == 0.01
+
+
+def test_episodes_that_are_too_short_are_left_out_before_anything_is_computed(tmp_path: Path):
+    files = recordings()
+    del files["motor1/run1.csv"][62:]
+    found = discover(written(tmp_path, files), fewest=65)
+    assert found.findings == ("left out, motor1/run1.csv: it has 60 samples that can be used, and kros run needs 65",)
+    with pytest.raises(DataError, match=r"none of 6 episodes can be used; episode .*: it has .* kros run needs 200"):
+        discover(tmp_path, fewest=200)
+
+
+def test_an_episode_counts_up_to_a_gap_that_cannot_be_bridged(tmp_path: Path):
+    files = recordings(300)
+    files["motor2/run2.csv"][62:262] = [f"{line.partition(',')[0]},,," for line in files["motor2/run2.csv"][62:262]]
+    found = discover(written(tmp_path, files), fewest=65)
+    assert found.findings == ("left out, motor2/run2.csv: it has 60 samples that can be used, and kros run needs 65",)
+
+
+def test_single_recordings_are_cut_into_as_many_episodes_as_they_hold(tmp_path: Path):
+    files, names = recordings(900, [1]), Wanted(files=r"motor(?P<unit>\d)")
+    assert discover(written(tmp_path, files), names, fewest=65).mapping["pieces"] == 4
+    files = recordings(130, [1])
+    assert discover(written(tmp_path, files), names, fewest=65).mapping["pieces"] == 2
+    files = recordings(129, [1])
+    with pytest.raises(DataError, match="every unit has one episode that can be used, and two are needed, of 65"):
+        discover(written(tmp_path, files), names, fewest=65)
 
 
 @pytest.mark.parametrize("bad", range(3))

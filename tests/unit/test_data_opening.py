@@ -74,3 +74,10 @@ def test_unknown_reader_and_options(folders: Path) -> None:
         read(folders / "parquet", "parquet", mapping=MAPPING)
     with pytest.raises(ConfigError, match=r"data\.prepare\[0\] \(step 'trim'\): from: unexpected keyword argument"):
         read(folders / "parquet", "parquet", prepare=[{"step": "trim", "from": 3}])
+
+
+def test_another_reader_is_named_where_it_fits(folders: Path) -> None:
+    with pytest.raises(DataError, match=r'these are parquet recordings; set data\.reader = "parquet"'):
+        read(folders / "parquet", "motor-drive-raw")
+    with pytest.raises(DataError, match=r"these are motor-drive-raw recordings; set data\.reader"):
+        read(folders / "motor-drive-raw", "parquet")

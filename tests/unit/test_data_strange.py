@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import Channel, Population, Role, from_arrays
+from kros.data import Channel, Population, Role, from_arrays, prepare
 from kros.data.readers.csv_folder import read_csv_folder
 from kros.data.readers.opening import detect_reader
+from kros.data.steps import Resample, Scale
 from kros.identify.survey import survey
 
 CHANNELS = (Channel("angle", Role.STATE, "", True), Channel("speed", Role.STATE), Channel("torque", Role.INPUT))
@@ -126,3 +127,19 @@ def test_folders_of_these_names_are_no_proof_of_the_raw_layout(tmp_path: Path, n
     assert detect_reader(tmp_path) == "csv"
     (tmp_path / name / "20240101T120000_001011_load").mkdir()
     assert detect_reader(tmp_path) == "motor-drive-raw"
+
+
+def test_the_resolution_of_a_sensor_is_that_of_what_was_recorded() -> None:
+    rng = np.random.default_rng(0)
+    episodes = {unit: [np.rint(rng.normal(size=(200, 2)) / 0.1) * 0.01 for _ in range(2)] for unit in "abc"}
+    episodes["a"][0][7] += 1e-6  # one sample that is off the grid
+    recorded = from_arrays(episodes, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    for declared in (
+        [],
+        [Resample(0.007)],
+        [Scale(("x",), 100.0), Resample(0.004)],
+        [Resample(0.005), Scale(("x",), 100.0)],
+    ):
+        resolution = survey(prepare(recorded, declared))[1].resolution
+        scale = 100.0 if any(isinstance(step, Scale) for step in declared) else 1.0
+        assert resolution["x"] == pytest.approx(0.01 * scale)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from random_models import random_observer
 
-from kros.core.errors import DimensionError
+from kros.core.errors import DataError, DimensionError
 from kros.data import EpisodeBatch
 from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
@@ -34,6 +34,18 @@ def test_a_controller_of_the_wrong_size_is_refused():
         Observer("x", LIFTING, o.A, o.B, (0,), ("a", "b"), o.controller, Injection.INPUT, 0.001)
     with pytest.raises(DimensionError, match="at least one sample"):
         run_observer(o, np.zeros((5, 2, 1)), np.zeros((4, 2, 2)))
+
+
+def test_masked_measurements_are_missing_and_text_is_refused():
+    o, masked = random_observer(LIFTING), np.ma.masked_array([0.4], [True])
+    expected = o.start([0.5]).step([np.nan], [1.0, 2.0])
+    np.testing.assert_array_equal(o.start([0.5]).step(masked, [1.0, 2.0]), expected)
+    y = np.ma.masked_array(np.full((9, 2, 1), 0.5), np.arange(18).reshape(9, 2, 1) % 4 == 3)
+    np.testing.assert_array_equal(o.run(y, np.ones((9, 2, 2))), o.run(y.filled(np.nan), np.ones((9, 2, 2))))
+    with pytest.raises(DataError, match=r"measurements should be numbers, found \['full'\]"):
+        o.start([0.5]).step(["full"], [1.0, 2.0])
+    with pytest.raises(DataError, match=r"inputs should be numbers, found \[\[1.0\], \[2.0, 3.0\]\]"):
+        o.start([0.5]).step([0.5], [[1.0], [2.0, 3.0]])
 
 
 def test_open_loop_equals_a_free_run_from_the_first_measurement():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ def recorded(noise: float, unit: str = "V", seed: int = 0, **inputs: Any) -> Pop
     arrays = {name: [episode(), episode()] for name in ("a", "b")}
     population = kros.from_arrays(arrays, states=["x"], inputs=["u"], measured=["x"], sample_period_s=PERIOD)
     channels = (population.channels[0], type(population.channels[1])("u", "input", unit))
-    return type(population)(**{**vars(population), "channels": channels})
+    return replace(population, columns=channels)
 
 
 @pytest.fixture(scope="module")

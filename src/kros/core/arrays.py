@@ -28,3 +28,14 @@ Whole = NDArray[np.int64]
 def frozen(cls: type[T]) -> type[T]:
     """Make a class a frozen dataclass that is compared by identity: arrays have no one truth value."""
     return dataclass(frozen=True, eq=False)(cls)
+
+
+def as_numbers(values: Any) -> Array:
+    """Return an array of doubles, NaN for what is masked; text, complex numbers and dates are refused."""
+    parts = values if isinstance(values, list | tuple) else [values]
+    masked = any(isinstance(part, np.ma.MaskedArray) for part in parts)
+    array = np.ma.asarray(values) if masked else np.asarray(values)
+    mixed = array.dtype.kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in array.ravel().tolist())
+    if mixed or array.dtype.kind not in "biufO":
+        raise TypeError(f"{'text or complex' if mixed else array.dtype} cannot be used as real numbers")
+    return np.ma.filled(array.astype(float, copy=False), np.nan)

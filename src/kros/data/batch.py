@@ -69,11 +69,11 @@ class EpisodeBatch:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
         if twice := [str(key) for key, count in Counter(keys).items() if count > 1]:
             raise DataError(f"Reading a batch of episodes: {some(twice)} named more than once; name each once.")
-        pairs = [population.read_with_truths(key) for key in keys]
-        batch = cls.of(population, {k: e[:max_samples] for k, (e, _) in zip(keys, pairs, strict=True)}, parameters)
+        pairs = {key: population.read_with_truths(key) for key in keys}
+        batch = cls.of(population, {key: values[:max_samples] for key, (values, _) in pairs.items()}, parameters)
         if not (truths and population.truths):
             return batch
-        return replace(batch, truths=_side_by_side([t[:max_samples] for _, t in pairs], batch.lengths))
+        return replace(batch, truths=_side_by_side([of[:max_samples] for _, of in pairs.values()], batch.lengths))
 
     @classmethod
     def of(

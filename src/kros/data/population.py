@@ -146,13 +146,6 @@ def columns_in_order(channels: Iterable[Any]) -> tuple[Any, ...]:
     return tuple(sorted(channels, key=lambda c: list(Role).index(c.role)))
 
 
-def part_columns(columns: Iterable[Channel]) -> Record:
-    """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
-    columns = tuple(columns)
-    truths = tuple(c for c in columns if c.role is Role.TRUTH)
-    return {"channels": tuple(c for c in columns if c.role is not Role.TRUTH), "truths": truths}
-
-
 @dataclass(frozen=True)
 class Split:
     """Training and test episodes, in natural order."""
@@ -167,8 +160,8 @@ class Population(Shown):
 
     Parameters
     ----------
-    channels : tuple of Channel
-        Columns of every episode: states first, inputs after them.
+    columns : tuple of Channel
+        Of the source: states first, inputs after them, then truths, what some states really were.
     sample_period_s : float
     units : tuple of Unit
     episodes : tuple of EpisodeKey
@@ -177,8 +170,6 @@ class Population(Shown):
         Reads episodes, float64, shape (n_samples, n_channels + n_truths); `read` and `from_arrays` make it.
     metadata : mapping
         Facts about the batch, for example ``{"plant": "harmonic-drive", "gear_ratio": 100}``.
-    truths : tuple of Channel
-        Further columns of the source, behind the inputs: what some states really were. For evaluation only.
     scaling : mapping of str to Scaling
         The columns that channels were read from, and how; a channel that is not named is the column of its name.
 
@@ -194,13 +185,12 @@ class Population(Shown):
     (5, 2)
     """
 
-    channels: Channels
+    columns: Channels
     sample_period_s: float
     units: tuple[Unit, ...]
     episodes: Keys
     source: Any  # kros.data.prepare.PreparedSource
     metadata: ByName = field(default_factory=dict)
-    truths: Channels = ()
     scaling: Mapping[str, Scaling] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -216,25 +206,30 @@ class Population(Shown):
         counts = {"units": len(self.unit_ids), "episodes": len(self.episodes)}
         return {**counts, "conditions": ", ".join(self.conditions), "period": f"{self.sample_period_s:g} s", **rows}
 
+    @cached_property
+    def channels(self) -> Channels:
+        """Columns of every episode: states, then inputs."""
+        return tuple(c for c in self.columns if c.role is not Role.TRUTH)
+
     @property
-    def columns(self) -> Channels:
-        """All columns of the source: channels, then truths."""
-        return self.channels + self.truths
+    def truths(self) -> Channels:
+        """Columns behind them, for evaluation only: what some states really were."""
+        return self.columns[len(self.channels) :]
 
     @property
     def states(self) -> Names:
         """Names of the states, in column order."""
-        return tuple(c.name for c in self.channels if c.role is Role.STATE)
+        return tuple(c.name for c in self.columns if c.role is Role.STATE)
 
     @property
     def inputs(self) -> Names:
         """Names of the inputs, in column order."""
-        return tuple(c.name for c in self.channels if c.role is Role.INPUT)
+        return tuple(c.name for c in self.columns if c.role is Role.INPUT)
 
     @property
     def measured(self) -> Names:
         """Names of the states that are available at run time."""
-        return tuple(c.name for c in self.channels if c.role is Role.STATE and c.measured)
+        return tuple(c.name for c in self.columns if c.role is Role.STATE and c.measured)
 
     @property
     def true_states(self) -> Columns:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -10,18 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ValidationError
 
-from ..core import Array, ByName, ConfigError, DataError, Record, digest_of, frozen, shortened, stamp_of, united
-from .population import Channels, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key, part_columns
-from .recording import (
-    Recording,
-    Recordings,
-    check_episode,
-    check_even,
-    check_period,
-    check_structure,
-    checked_blocks,
-    estimate_period,
-)
+from ..core import Array, ByName, ConfigError, DataError, digest_of, frozen, shortened, stamp_of, united
+from .population import Channels, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key
+from .recording import Recording, Recordings, check_even, check_period, check_structure, checked_blocks, estimate_period
 from .steps import STEPS, Signals, Step
 
 HEAD = 100_000  # samples whose median step is the period
@@ -40,10 +32,7 @@ class PreparedSource:
 
     def __call__(self, key: EpisodeKey) -> Array:
         """Return one prepared episode, shape (n_samples, n_channels)."""
-        recording = self.recordings(key)
-        self._check_time(recording)
-        values, channels = self._prepared(recording)
-        check_episode(values, key, channels, gaps=self.gaps)
+        (values,) = self._checked(key, [self.recordings(key)])
         return values
 
     def _check_time(self, recording: Recording) -> None:
@@ -52,8 +41,8 @@ class PreparedSource:
             file = self.recordings.file(self.recordings.places[recording.key])
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
 
-    def _prepared(self, recording: Recording) -> tuple[Array, Channels]:
-        """Return what steps make of an episode, or of a part of it, and the channels."""
+    def _prepared(self, recording: Recording) -> Array:
+        """Return what steps make of an episode, or of a part of it."""
         signals = Signals(self.channels, self.period_s)
         # A running observer has to see that a sample is missing; training does not.
         if not self.gaps and any(step.makes_even for step in self.steps):
@@ -61,14 +50,19 @@ class PreparedSource:
         for step in self.steps:
             recording = step.apply(recording, signals.channels, signals.period_s)
             signals = step.describe(signals)
-        return recording.values, signals.channels
+        return recording.values
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
         """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
         if all(step.samplewise for step in self.steps):
-            return checked_blocks(self._in_turn(self.recordings.blocks(key, rows)), key, self.channels, gaps=self.gaps)
+            return self._checked(key, self.recordings.blocks(key, rows))
         values = self(key)
         return (values[k : k + rows] for k in range(0, len(values), rows))
+
+    def _checked(self, key: EpisodeKey, blocks: Iterable[Recording]) -> Iterator[Array]:
+        """Return blocks of an episode after their steps, none of them empty, checked."""
+        channels = described(Signals(self.channels, self.period_s), self.steps).channels
+        return checked_blocks(self._in_turn(blocks), key, channels, gaps=self.gaps)
 
     def _in_turn(self, blocks: Iterable[Recording]) -> Iterator[Array]:
         """Yield blocks of an episode after their steps; time is checked from the sample before on."""
@@ -77,7 +71,7 @@ class PreparedSource:
             if block.time_s is not None:
                 self._check_time(replace(block, time_s=np.append(end, block.time_s)))
                 end = block.time_s[-1:]
-            yield self._prepared(block)[0]
+            yield self._prepared(block)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> PreparedSource:
         """Return the same for fewer episodes."""
@@ -102,13 +96,28 @@ def assemble(
     episodes = tuple(sorted(recordings.places, key=lambda key: [(natural_key(name), name) for name in astuple(key)]))
     facts = {unit.id: unit for unit in units}
     known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
+    reference = episodes[0]
     if sample_period_s is None:
-        sample_period_s = estimate_period(next(recordings.blocks(episodes[0], HEAD)))
+        sample_period_s, reference = _first_period(recordings, episodes)
     period = check_period(sample_period_s, "Population")
-    source = PreparedSource(recordings, channels, period, episodes[0])
-    about: Record = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
-    population = Population(sample_period_s=period, units=known, episodes=episodes, source=source, **about)
-    return prepare(population, steps)
+    source = PreparedSource(recordings, channels, period, reference)
+    about = dict(metadata or {}), dict(scaling or {})
+    return prepare(Population(channels, period, known, episodes, source, *about), steps)
+
+
+def described(signals: Signals, steps: Iterable[Step]) -> Signals:
+    """Return signals as steps leave them."""
+    for step in steps:
+        signals = step.describe(signals)
+    return signals
+
+
+def _first_period(recordings: Recordings, episodes: Sequence[EpisodeKey]) -> tuple[float, EpisodeKey]:
+    """Return the sampling period of the first episode whose beginning can be read, and this episode."""
+    for key in episodes:
+        with suppress(DataError):
+            return estimate_period(next(recordings.blocks(key, HEAD))), key
+    return estimate_period(recordings(episodes[0])), episodes[0]  # says why not
 
 
 def with_gaps(population: Population) -> Population:
@@ -145,13 +154,11 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     [2.0, 8.0, 18.0]
     """
     added = tuple(steps)
-    signals = Signals(population.columns, population.sample_period_s, population.scaling)
-    for step in added:
-        signals = step.describe(signals)
+    signals = described(Signals(population.columns, population.sample_period_s, population.scaling), added)
     check_structure(signals.channels, population.episodes)
-    about: Record = {"scaling": signals.scaling, **part_columns(signals.channels)}
+    columns, period, scaling = columns_in_order(signals.channels), signals.period_s, signals.scaling
     source = replace(population.source, steps=population.source.steps + added)
-    return replace(population, sample_period_s=signals.period_s, source=source, **about)
+    return replace(population, columns=columns, sample_period_s=period, scaling=scaling, source=source)
 
 
 def parse_steps(tables: Iterable[Step | ByName], where: str = "data.prepare") -> tuple[Step, ...]:
@@ -190,8 +197,8 @@ def scale_population(population: Population, sizes: Mapping[str, float]) -> Popu
     owners = [c.of or c.name for c in population.columns]
     divided = _Divide(tuple(float(sizes.get(name, 1.0)) for name in owners))
     source = replace(population.source, steps=(*population.source.steps, divided))
-    columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]
-    return replace(population, source=source, **part_columns(columns))
+    columns = (replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True))
+    return replace(population, source=source, columns=tuple(columns))
 
 
 def recording_marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:

@@ -83,24 +83,21 @@ class Recording:
 
 @frozen
 class Recordings:
-    """Episodes of a reader, read one at a time; a format overrides `read`. Can be pickled when `places` can."""
+    """Episodes of a reader, read one at a time; a format overrides `blocks`. Can be pickled when `places` can."""
 
     places: Mapping[EpisodeKey, Any]  # where each episode is
-
-    def read(self, key: EpisodeKey, place: Any) -> Recording:
-        """Return one episode as recorded."""
-        raise NotImplementedError
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode."""
         if key not in self.places:
             others = f"this source has {len(self.places)} other episodes"
             raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
-        return self.read(key, self.places[key]).distinct().ended()
+        (recording,) = self.blocks(key)
+        return recording.distinct().ended()
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
-        """Yield one episode in blocks of about `rows` samples where the format can, else whole."""
-        yield self(key)
+    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
+        """Yield one episode as recorded, in blocks of about `rows` samples where the format can, else whole."""
+        raise NotImplementedError
 
     def file(self, place: Any) -> Path | None:
         """Return the one file that an episode is in, where it is in one."""
@@ -132,9 +129,7 @@ def estimate_period(recording: Recording) -> float:
     if len(time) < 2:
         need = "the sampling period needs at least two samples with time"
         raise DataError(f"{name}: {need}, found {len(time)}; leave the episode out.")
-    steps = np.diff(time)
-    shortest, longest = (float(f"{step:.6g}") for step in (steps.min(), steps.max()))
-    period = shortest if shortest == longest else float(f"{np.median(steps):.6g}")  # rounding keeps order
+    period = float(f"{np.median(np.diff(time)):.6g}")
     if not period > 0:
         advice = "name the column that holds time, in seconds and increasing"
         raise DataError(f"{name}: the median time step is {period:g} s; {advice}.")
@@ -187,9 +182,9 @@ class NonFiniteError(DataError):
     """An episode holds NaN or infinity."""
 
 
-def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
+def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel]) -> None:
     """Check one episode's samples: shape, length, numbers, and that no state stands still while others move."""
-    for _ in checked_blocks([values], key, channels, gaps=gaps):
+    for _ in checked_blocks([values], key, channels, gaps=False):
         pass
 
 
@@ -236,7 +231,7 @@ def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], fi
             f"above {limits.MAX_VALUE:g}": ~usable(signal) & np.isfinite(signal),
             "infinity": np.isinf(signal),
         }
-        bad = np.flatnonzero(np.any(list(kinds.values()), axis=0))
+        bad = np.flatnonzero(~usable(signal))
         if bad.size:
             what = " and ".join(kind for kind, places in kinds.items() if places.any())
             where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
@@ -250,24 +245,24 @@ class GroupWatch:
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         self._channels = channels
-        self._resting: list[dict[int, float]] = []
-        # of every episode: quantiles (3, n), ranges (n,), the samples that are farthest from the median, and values
-        self._signals: dict[EpisodeKey, tuple[Array, Array, Index, Array]] = {}
+        # of every episode: quantiles (3, n), ranges (n,), the samples that are farthest from the median, values there,
+        # and where channels rest, NaN for one that moves
+        self._looks: dict[EpisodeKey, tuple[Array, Array, Index, Array, Array]] = {}
 
     def add(self, key: EpisodeKey, values: Array) -> None:
         """Look at one more episode, all of whose samples are usable."""
-        signals = [i for i, c in enumerate(self._channels) if c.role is not Role.TRUTH]
-        self._resting.append({i: float(values[0, i]) for i in signals if is_constant(values[:, i])})
         outside = max(1, len(values) // 100)  # at each end; one at least, for short episodes
         rows = [outside, len(values) // 2, len(values) - 1 - outside]
         quantiles = np.partition(values, rows, axis=0)[rows]
         at = np.abs(values - quantiles[1]).argmax(axis=0)
-        self._signals[key] = quantiles, np.ptp(values, axis=0), at, values[at, np.arange(len(at))]
+        resting = np.where([is_constant(signal) for signal in values.T], values[0], np.nan)
+        self._looks[key] = quantiles, np.ptp(values, axis=0), at, values[at, np.arange(len(at))], resting
 
     def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
         """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, median range) > 0, and the place."""
-        for key, ((low, middle, high), _, samples, values) in self._signals.items():
-            usual = np.quantile([of[1] for of in self._signals.values()], 0.5, axis=0, method="lower")
+        ranges = [look[1] for look in self._looks.values()]
+        usual = np.quantile(ranges, 0.5, axis=0, method="lower") if ranges else np.zeros(1)
+        for key, ((low, middle, high), _, samples, values, _) in self._looks.items():
             size = np.max([high - low, np.abs(low), np.abs(high), usual], axis=0)  # it may rest in 99 % of an episode
             for i in map(int, np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))):
                 actual = f"{values[i]:g} at sample {samples[i]}"
@@ -278,13 +273,14 @@ class GroupWatch:
         """Raise DataError for wild samples, and for an input or a state that never changed."""
         for key, problem in self.wild():
             raise DataError(f"{title(key)}: {problem}; fix the source, or leave the episode out.")
-        first = self._resting[0] if self._resting else {}
-        for i in sorted(set(first).intersection(*self._resting)):
-            key, channel = next(iter(self._signals)), self._channels[i]
-            if channel.role is Role.INPUT and any(resting[i] != first[i] for resting in self._resting):
-                continue  # it differs from episode to episode
+        rests = np.array([look[-1] for look in self._looks.values()]).T
+        for channel, rest in zip(self._channels, rests, strict=False):
+            differs = channel.role is Role.INPUT and (rest != rest[0]).any()  # from episode to episode
+            if channel.role is Role.TRUTH or differs or np.isnan(rest).any():
+                continue
+            key = next(iter(self._looks))
             what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays where it is"
-            place = f"in each of {len(self._resting)} episodes, in the first at {first[i]:g}"
+            place = f"in each of {len(rest)} episodes, in the first at {rest[0]:g}"
             raise DataError(f"{what} {place}; check the sensor and the column, or remove the channel or the unit.")
 
 
@@ -300,7 +296,7 @@ def check_names(kind: str, names: Iterable[Any]) -> None:
 def check_period(period_s: Any, what: str) -> float:
     """Return a sampling period that is a number of seconds above zero."""
     is_number = isinstance(period_s, Real) and not isinstance(period_s, bool)
-    if not is_number or not 1 / limits.MAX_VALUE < period_s < limits.MAX_VALUE:
+    if not is_number or not 1 / limits.MAX_VALUE < float(period_s) < limits.MAX_VALUE:
         wanted, actual = "should be a number of seconds above zero", shortened(repr(period_s))
         raise DataError(f"{what}: the sampling period {wanted}, found {actual}; give it in seconds.")
     return float(period_s)
@@ -326,10 +322,9 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
         raise DataError(f"A channel with role 'truth' {wanted}, found {truths}; correct them.")
     if not episodes:
         raise DataError("The population is empty: no episode was found; check the source and the reader.")
-    copies = [(key, count) for key, count in Counter(episodes).items() if count > 1]
-    if copies:
-        actual = f"{copies[0][0]} occurs {copies[0][1]} times ({len(copies)} such episodes)"
-        raise DataError(f"Duplicate episodes: {actual}; rename or remove the copies.")
+    ((key, count),) = Counter(episodes).most_common(1)
+    if count > 1:
+        raise DataError(f"Duplicate episodes: {key} occurs {count} times; rename or remove the copies.")
 
 
 def check_population(population: Population, allow_single: bool = False) -> None:

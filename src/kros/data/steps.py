@@ -270,11 +270,8 @@ class Resample(Step):
         time = np.arange(len(recording.values), dtype=np.float64) * period_s if time is None else time
         timed = replace(recording, time_s=time)
         check_increasing(timed)
-        limit = self.max_gap_s or GAP * estimate_period(timed)
-        edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > limit) + 1, [len(time)]])
-        longest = int(np.diff(edges).argmax())
-        stretch = slice(edges[longest], edges[longest + 1])
-        timed, time = timed.cut(stretch.start, stretch.stop), time[stretch]
+        start, stop = longest_stretch(time, self.max_gap_s or GAP * estimate_period(timed))
+        timed, time = timed.cut(start, stop), time[start:stop]
         median = estimate_period(timed)
         count = (time[-1] - time[0]) / min(self.period_s, median)
         if count > limits.MAX_SAMPLES:
@@ -325,6 +322,13 @@ class Differentiate(Step):
     def _position(self, channels: Channels) -> int:
         """Return where the new channel stands."""
         return len(channels) if self.of else [c.role for c in channels].count(Role.STATE)
+
+
+def longest_stretch(time_s: Array, gap_s: float) -> tuple[int, int]:
+    """Return the first sample of the longest stretch in which no step of time is longer than a gap, and its end."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(time_s) > gap_s) + 1, [len(time_s)]])
+    longest = int(np.diff(edges).argmax())
+    return int(edges[longest]), int(edges[longest + 1])
 
 
 def lowpass(values: Array, cutoff: float) -> Array:

@@ -18,10 +18,10 @@ import numpy as np
 from ..core import ITERATED, Array, DataError, Work
 from ..core.artifacts import Storable, divided, file_digest
 from ..core.files import is_file, link_or_copy
-from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
+from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, scaling_of, split_episodes
 from ..data.prepare import recording_marks
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
-from ..data.recording import CHECK, check_population, refuse_copies, some, title, usable_episodes
+from ..data.recording import CHECK, check_population, refuse_copies, some, title, usable, usable_episodes
 from .likeness import course, moments, odd, unlike
 
 
@@ -189,7 +189,7 @@ def _facts(
         groups=groups,
         train=train,
         test=test,
-        resolution={m: min(g.resolution[m] for g in read) for m in retained.measured},
+        resolution={m: _median([g.resolution[m] for g in read]) for m in retained.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
         alerts=(*period_alerts(retained.sample_period_s), *_unlike(retained, read, groups), *strange),
         reserve=tuple(options.reserve),
@@ -233,25 +233,42 @@ def _read_group(task: _Group) -> _GroupFacts:
     names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
     covariances = list[Array]()
 
-    def usable() -> Iterator[tuple[EpisodeKey, Array, str]]:
+    def episodes_in_turn() -> Iterator[tuple[EpisodeKey, Array, str]]:
         for key, values, digest in usable_episodes(population, task.on_nan):
-            for name in population.measured if not episodes else ():
-                resolution[name] = smallest_step(values[:, names.index(name)])
+            if not episodes:
+                resolution.update(_resolution(population, key, values))
             of_states = course(values[:, : len(names)])[:, : len(population.states)]
             episodes.append(_EpisodeFacts(key, digest, len(values), of_states))
             covariances.append(moments(values[:, : len(names)]))
             yield key, values, digest
 
     if task.folder is None:
-        deque(usable(), maxlen=0)
+        deque(episodes_in_turn(), maxlen=0)
     else:
-        record = write_group(population, task.folder, usable())
+        record = write_group(population, task.folder, episodes_in_turn())
         written = file_digest(task.folder / record.file)
     return _GroupFacts(record, written, resolution, episodes, np.mean(covariances, axis=0))
 
 
+def _median(steps: list[float]) -> float:
+    """Return the median of the steps of all units, one of them where there are two."""
+    return float(np.quantile(steps, 0.5, method="lower"))
+
+
+def _resolution(population: Population, key: EpisodeKey, prepared: Array) -> dict[str, float]:
+    """Return the smallest step of every measured channel, as recorded where samples are interpolated."""
+    source, signals = population.source, dict(zip([c.name for c in population.columns], prepared.T, strict=True))
+    if any(step.makes_even for step in source.steps):
+        recorded = source.recordings(key).values
+        for channel, column in zip(source.channels, recorded.T, strict=True):
+            scaling = scaling_of(population.scaling, channel.name)
+            signals[channel.name] = column * (scaling.factor / scaling.converted)
+    return {name: smallest_step(signals[name]) for name in population.measured}
+
+
 def smallest_step(signal: Array) -> float:
     """Return the smallest step between samples, the quantisation of a digital sensor; rounding where there is none."""
+    signal = signal[usable(signal)]
     steps, floor = np.abs(np.diff(signal)), ITERATED * float(np.abs(signal).max())
     smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
     return smallest if np.isfinite(smallest) else floor

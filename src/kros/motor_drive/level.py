@@ -69,18 +69,18 @@ class AngleLoad:
     def _running(self, seen: Array, current: Array, position: Array) -> Iterator[tuple[Array, Array]]:
         """Yield load and total current sample by sample, from the observer's and the measured angles in rad."""
         limit, pole = self.limit, self.pole
-        before = np.stack([np.sin(position[0]), np.cos(position[0])])
+        directions = np.stack([np.sin(position), np.cos(position)], axis=-1)
+        before = directions[0]
         psi, right = np.zeros_like(before), np.zeros_like(before)
-        excess, need = np.zeros((2, *position[0].shape))  # taken off the load, and off the unloaded current
-        gram = 0.5 * self.settling_s * np.eye(2)[:, :, None] * np.ones_like(position[0])
-        for tau, i, angle in zip(seen, current, position, strict=True):
-            phi = np.stack([np.sin(angle), np.cos(angle)])
+        excess, need = np.zeros((2, len(before)))  # taken off the load, and off the unloaded current
+        gram = np.tile(0.5 * self.settling_s * np.eye(2), (len(before), 1, 1))
+        for tau, i, phi in zip(seen, current, directions, strict=True):
             phi = np.where(np.isnan(phi), before, phi)
             psi = pole * psi + np.nan_to_num(phi - before)
             before, excess, need = phi, pole * excess, pole * need
-            coefficients = np.linalg.solve(gram.transpose(2, 0, 1), right.T[..., None])[..., 0].T
-            of_angle = np.sum(np.nan_to_num(phi) * coefficients, axis=0)  # zero where no angle has arrived yet
-            load = tau - excess + of_angle - np.sum(psi * coefficients, axis=0)
+            coefficients = np.linalg.solve(gram, right[..., None])[..., 0]
+            of_angle = np.sum(np.nan_to_num(phi) * coefficients, axis=1)  # zero where no angle has arrived yet
+            load = tau - excess + of_angle - np.sum(psi * coefficients, axis=1)
             total = i - tau - need + load
             bounded = np.clip(total, -limit, limit)
             beyond = bounded != total
@@ -90,13 +90,13 @@ class AngleLoad:
                 anew = beyond & ~trusted
                 excess[trusted] += (total - bounded)[trusted]
                 load[trusted] = shifted[trusted]
-                psi[:, anew], excess[anew], load[anew] = 0.0, tau[anew], of_angle[anew]
+                psi[anew], excess[anew], load[anew] = 0.0, tau[anew], of_angle[anew]
                 total[anew] = (i - tau - need + load)[anew]
                 bounded[anew] = np.clip(total[anew], -limit, limit)
                 need[anew] += (total - bounded)[anew]
-            learns = np.where(beyond, 0.0, self.sample_period_s)
-            gram = gram + learns * psi[:, None] * psi
-            right = right + learns * psi * (tau - excess)
+            learned = psi * np.where(beyond, 0.0, self.sample_period_s)[:, None]
+            gram = gram + learned[..., None] * psi[:, None]
+            right = right + learned * (tau - excess)[:, None]
             yield load, bounded
 
     @property

@@ -29,9 +29,9 @@ LOAD = "load"
 class LoadSettings:
     """How a known load is read."""
 
-    current: int | None = None  # state that carries the load, in the load's unit; None where none does
+    current: int  # state that carries the load, in the load's unit
     level_s: float = 10.0  # s; time after which a constant load is forgotten
-    corner_hz: float | None = None  # what is faster in the known load, such as vibrations of the gear, is no load
+    corner_hz: float = 20.0  # what is faster in the known load, such as vibrations of the gear, is no load
     limit: float = np.inf  # of the current; episodes that reach it are left out
     delays: int = 20  # of the estimator, in samples: few recordings have a known load
     restart_share: float = 1e-9  # of the estimator, at all times; the load of the first sample is in its tracking error
@@ -44,32 +44,34 @@ def load_observer(
     inputs: Sequence[str],
     batch: EpisodeBatch,
     load: Array,
-    settings: LoadSettings | None = None,
+    settings: LoadSettings,
 ) -> tuple[Observer, tuple[int, ...]]:
     """Return the estimator of the recorded states and ``load``, and the episodes whose current reaches its limit.
 
     The functions of the lifting read measured states alone, and so does it at run time. `load`, (n_samples, batch), is
     zero in recordings without load; the estimated one and, under load, the current lack their level (`AngleLoad`).
     """
-    settings = settings or LoadSettings()
     if batch.states.shape[:2] != load.shape or LOAD in lifting.states:
         raise DimensionError(
             f"Load observer: states {batch.states.shape} and load {load.shape} should agree in (n_samples, batch), "
             f"and no state be named {LOAD!r}, found {', '.join(lifting.states)}."
         )
-    at_limit = np.zeros(len(batch.keys), bool)  # where the controller does not do what its errors say
-    if settings.current is not None:
-        at_limit = np.abs(batch.states[..., settings.current]).max(axis=0) >= settings.limit
+    # where the controller does not do what its errors say
+    at_limit = np.abs(batch.states[..., settings.current]).max(axis=0) >= settings.limit
     used = np.flatnonzero(~at_limit)
     visible = _visible(batch.take(used.tolist()), load[:, used], int(at_limit.sum()), settings)
     place = {key: i for i, key in enumerate(visible.keys)}
     lengths = visible.lengths
     recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
     lag = settings.level_s / batch.sample_period_s
-    bank = {"dense": settings.delays, "longest": settings.delays}
-    lags = {"first_lag": lag, "last_lag": lag / recordings.length}
-    restarts = dict.fromkeys(("restart_share", "settled_share"), settings.restart_share)
-    estimator = EstimatorSettings(**bank, **lags, **restarts)
+    estimator = EstimatorSettings(
+        dense=settings.delays,
+        longest=settings.delays,
+        first_lag=lag,
+        last_lag=lag / recordings.length,
+        restart_share=settings.restart_share,
+        settled_share=settings.restart_share,
+    )
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     result = identify_estimator(
         name, with_load, tuple(measured), inputs, recordings, batch.sample_period_s, None, estimator
@@ -86,11 +88,9 @@ def _visible(batch: EpisodeBatch, load: Array, left_out: int, settings: LoadSett
             f"{int((~loaded).sum())}; {left_out} come to the current's limit; take a smaller load or slower moves."
         )
     dt = batch.sample_period_s
-    torque = load if settings.corner_hz is None else low_passed(load, settings.corner_hz, dt)
-    seen = without_level(torque, settings.level_s, dt)
+    seen = without_level(low_passed(load, settings.corner_hz, dt), settings.level_s, dt)
     states = np.concatenate([batch.states, seen[..., None]], axis=-1)
-    if settings.current is not None:
-        states[..., settings.current] -= load - without_level(load, settings.level_s, dt)
+    states[..., settings.current] -= load - without_level(load, settings.level_s, dt)
     # Keys of one unit: units with a known load are too few to leave one out.
     keys = tuple(EpisodeKey("", "loaded" if on else "unloaded", str(i)) for i, on in enumerate(loaded))
     return replace(batch, keys=keys, states=states, shown=None, lost=None)

@@ -12,7 +12,7 @@ import numpy as np
 from ..core import AnyArray, Array, ArrayLike, DimensionError, Names
 from .data import ObserverData
 from .monitor import Watch
-from .screen import Held, SampleStatus, Screen, Screened
+from .screen import Held, SampleStatus, Screen, Screened, numbers
 from .simulate import Course, stepped
 from .step import forward
 from .tracking import PhaseLockedLoop
@@ -164,6 +164,8 @@ class RunningObserver:
         ------
         DimensionError
             When there are not as many measurements or inputs as the observer has.
+        DataError
+            When they are no numbers.
         """
         course, watch, bank = self._course, self._watch, self.observer.bank
         sample = self._sample(y, u, course.held)
@@ -190,7 +192,7 @@ class RunningObserver:
         return self._screen.take(y[None, None], self._shaped(u, "inputs", inputs)[None, None], held)
 
     def _shaped(self, values: ArrayLike, what: str, names: Sequence[str]) -> Array:
-        array = np.array(values, dtype=float, ndmin=1)  # a copy: the caller may use its memory again
+        array = np.array(numbers(self.observer, values, what), ndmin=1)  # a copy: the caller may use its memory again
         if array.shape != (len(names),):
             raise DimensionError(
                 f"Running observer {self.observer.name}: expected the {len(names)} {what} {', '.join(names)}, shape "

@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core import DimensionError
-from ..core.arrays import Array, ArrayLike, Bits, Flags, Index, frozen
+from ..core import DataError, DimensionError, shortened
+from ..core.arrays import Array, ArrayLike, Bits, Flags, Index, as_numbers, frozen
 from .data import ObserverData
 from .runtime import Seen
 
@@ -166,7 +166,8 @@ class Screen:
 
 def screened(observer: ObserverData, y: ArrayLike, u: ArrayLike, held: Held | None = None) -> Screened:
     """Return a batch of samples as an observer takes them; `held` is known before the first."""
-    y, u, q, inputs = np.asarray(y, float), np.asarray(u, float), len(observer.measured), observer.inputs
+    y, u = numbers(observer, y, "measurements"), numbers(observer, u, "inputs")
+    q, inputs = len(observer.measured), observer.inputs
     n_samples, batch = y.shape[:2] if y.ndim == 3 and len(y) else (1, 0)
     if (y.shape, u.shape) != ((n_samples, batch, q), (n_samples, batch, len(inputs))):
         raise DimensionError(
@@ -174,6 +175,15 @@ def screened(observer: ObserverData, y: ArrayLike, u: ArrayLike, held: Held | No
             f"axes of y and u, (n_samples, batch, .), with at least one sample, found shapes {y.shape} and {u.shape}."
         )
     return Screen.of(observer).take(y, u, held)
+
+
+def numbers(observer: ObserverData, values: ArrayLike, what: str) -> Array:
+    """Return samples as numbers, NaN for what is masked."""
+    try:
+        return as_numbers(values)
+    except (TypeError, ValueError) as error:
+        actual = f"found {shortened(repr(values))} ({error})"
+        raise DataError(f"Running observer {observer.name}: {what} should be numbers, {actual}.") from error
 
 
 def _starts(lost: Flags, complete: Flags, stale: Flags) -> tuple[Flags, Flags]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -49,9 +49,9 @@ class SimulatedPopulation(Generic[T]):
 class SimulatedEpisodes(Recordings):
     """Raw episodes in memory, (n, n_samples) a part: states, inputs, what states really were."""
 
-    def read(self, key: EpisodeKey, place: tuple[Array, ...]) -> Recording:
-        """Return an episode."""
-        return Recording(key, np.ascontiguousarray(np.concatenate(place).T))
+    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
+        """Yield an episode."""
+        yield Recording(key, np.ascontiguousarray(np.concatenate(self.places[key]).T))
 
 
 @dataclass(frozen=True)
@@ -165,16 +165,13 @@ class Batch(BatchSettings, ABC, Generic[P]):
         inputs = np.stack([self.reference(self.random(INPUT_STREAM, e), n_samples) for e in range(self.n_episodes)])
         states, names = truth.respond(inputs), [c.name for c in self.channels]
         true = states[[names.index(t.of) for t in self.truths]]
-        keys = {
-            EpisodeKey(unit.id, DEFAULT_CONDITION, str(e)): (u, e)
-            for u, unit in enumerate(units)
-            for e in range(self.n_episodes)
-        }
-        for key, at in keys.items():
-            noise = self.random(NOISE_STREAM, int(key.unit), at[1]).standard_normal((len(self.noise), n_samples))
-            states[1 : 1 + len(noise), *at] += np.array(self.noise)[:, None] * noise
         states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
-        parts = {key: (states[:, u, e], inputs[e, None], true[:, u, e]) for key, (u, e) in keys.items()}
+        parts = dict[EpisodeKey, tuple[Array, Array, Array]]()
+        for u, e in np.ndindex(len(units), self.n_episodes):
+            noise = self.random(NOISE_STREAM, int(units[u].id), e).standard_normal((len(self.noise), n_samples))
+            states[1 : 1 + len(noise), u, e] += np.array(self.noise)[:, None] * noise
+            key = EpisodeKey(units[u].id, DEFAULT_CONDITION, str(e))
+            parts[key] = states[:, u, e], inputs[e, None], true[:, u, e]
         columns, about = (*self.channels, *self.truths), {"plant": truth.plant}
         population = assemble(SimulatedEpisodes(parts), columns, units, truth.sample_period_s, about)
         return SimulatedPopulation(population, population, truth)

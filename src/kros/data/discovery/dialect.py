@@ -8,15 +8,15 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ...core import DataError, Names, frozen
+from ...core import DataError, Names
 from ..measures import is_unit_row
 from ..readers.formats import is_binary, texts_of
-from ..readers.tables import ABSENT, ORDERS, Dialect, cells_of, file_fields, head_of, lines_of, microseconds
+from ..readers.tables import ABSENT, ORDERS, Dialect, Table, cells_of, head_of, lines_of, microseconds
 from .examine import RULE
 
 MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
@@ -26,14 +26,11 @@ _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
 _NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
 
 
-@frozen
-class TableHead:
-    """What the first lines of a file say."""
+@dataclass(frozen=True)
+class TableHead(Table):
+    """A table with the cells of its first rows of numbers; its fields are their numbers where there is no header."""
 
-    dialect: Dialect
-    fields: Names  # header; numbers of the columns as text where there is none
-    units: Names  # cells of the row of units of measure, empty where there is none
-    rows: tuple[Names, ...]  # cells of the first rows of numbers
+    rows: tuple[Names, ...]
 
     def cells(self, column: int) -> list[str]:
         """Return the first cells of a column."""
@@ -51,16 +48,16 @@ class TableHead:
             return None
         import pyarrow as pa
 
-        times = (microseconds(pa.array(cells), order) for order in ORDERS)
-        return next((order for order, values in zip(ORDERS, times, strict=True) if np.isfinite(values).all()), None)
+        stamps = pa.array(cells)
+        return next((order for order in ORDERS if np.isfinite(microseconds(stamps, order)).all()), None)
 
 
 def look_at(path: Path) -> TableHead:
     """Return how a file is written; a text file by the reading with most rows of numbers of equal width."""
     if is_binary(path):
-        fields, units = file_fields(path, Dialect())
-        cells = zip(*(texts_of(path, name)[: RULE.rows] for name in fields), strict=True)
-        return TableHead(Dialect(), tuple(fields), tuple(units), tuple(cells))
+        table = Table.open(path, Dialect())
+        cells = zip(*(texts_of(path, name)[: RULE.rows] for name in table.fields), strict=True)
+        return TableHead(**vars(table), rows=tuple(cells))
     content = head_of(path)
     encoding = encoding_of(content)
     lines = lines_of(content, encoding, path)
@@ -69,7 +66,7 @@ def look_at(path: Path) -> TableHead:
     if _score(rows, decimal)[0] < 2:
         actual = f"no rows of numbers were found in its first {len(lines)} lines"
         raise DataError(f"Reading {path}: {actual}; is it a recording?")
-    return _described(rows, Dialect(delimiter, decimal=decimal, encoding=encoding))
+    return _described(path, rows, Dialect(delimiter=delimiter, decimal=decimal, encoding=encoding))
 
 
 def encoding_of(content: bytes) -> str:
@@ -118,7 +115,7 @@ def _score(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, int]:
     return len(same), sum(1 + (decimal in c) for r in same for c in r if _is_number(c, decimal))
 
 
-def _described(rows: list[list[str]], dialect: Dialect) -> TableHead:
+def _described(path: Path, rows: list[list[str]], dialect: Dialect) -> TableHead:
     """Tell header, row of units and numbers apart."""
     data = [i for i, r in enumerate(rows) if _is_data(r, dialect.decimal)]
     width = _width([rows[i] for i in data])
@@ -129,8 +126,10 @@ def _described(rows: list[list[str]], dialect: Dialect) -> TableHead:
     blank = ("",) * width
     if not above:
         numbers = tuple(str(i + 1) for i in range(width))
-        return TableHead(replace(dialect, header=False, skip_rows=first), numbers, blank, cells)
+        bare = dialect.model_copy(update={"header": False, "skip_rows": first})
+        return TableHead(path, bare, numbers, blank, cells)
     unit_row = next((i for i in above[1:] if is_unit_row(rows[i])), None)
     header = above[-1] if unit_row is None else above[above.index(unit_row) - 1]
     fields, units = ((*row, *blank)[:width] for row in (rows[header], () if unit_row is None else rows[unit_row]))
-    return TableHead(replace(dialect, skip_rows=header, unit_rows=first - header - 1), fields, units, cells)
+    placed = dialect.model_copy(update={"skip_rows": header, "unit_rows": first - header - 1})
+    return TableHead(path, placed, fields, units, cells)

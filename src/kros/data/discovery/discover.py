@@ -7,28 +7,24 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_mean, frozen
 from ..measures import split_header
-from ..population import EpisodeKey, Population
+from ..population import EpisodeKey, Population, Role
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, part_of, read_csv_folder
-from ..readers.tables import Dialect, file_fields, read_blocks
+from ..readers.tables import Table, stretches
 from ..recording import CHECK, some, usable
 from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
-from .labels import label_columns, stretches
-from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
-
-_RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
+from .roles import UNKNOWN, ColumnPart, Samples, TableColumn, describe, label_columns, propose, time_columns, time_scale
 
 
 @dataclass(frozen=True)
@@ -51,29 +47,35 @@ class Discovery:
     population: Population  # as the mapping reads it, before preparation
     notes: dict[str, str] = field(default_factory=dict)  # what a key of the mapping rests on
     findings: Names = ()  # what looks wrong
-    drop_nan: bool = False  # whether episodes with NaN or infinity have to be dropped
     reading: str = ""  # what the first file was taken for
 
 
-def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None) -> Discovery:
-    """Describe a folder of tables."""
+def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None, fewest: int = 0) -> Discovery:
+    """Describe a folder of tables; an episode needs at least the `fewest` samples."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
-    names = infer_names(list(alike))
-    if wanted.files is None and names.other is not None:
+    pattern, other = infer_names(list(alike))
+    if wanted.files is None and other is not None:
         raise ConfigError(
             f"Names of files: {some(list(alike), 3)} can be episodes of one unit or units with one recording each; "
-            f"choose, --files '{names.other}' or --files '{names.pattern}'."
+            f"choose, --files '{other}' or --files '{pattern}'."
         )
-    mapping: Record = {"files": wanted.files or names.pattern}
-    mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
+    mapping: Record = {"files": wanted.files or pattern}
+    mapping |= head.dialect.model_dump(exclude_defaults=True)
     columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
     columns = _decided(columns, wanted)
-    mapping |= {**keys, "channel": [_channel(c) for c in columns if c.part in _RECORDED]}
-    population = read_csv_folder(source, mapping | _exclusion(strange))
-    draft = Discovery(mapping, (), tuple(columns), population, notes)
-    findings = [f"{len(strange)} files are not like the others and left alone: {some(strange)}"] if strange else []
-    return _examined(source, draft, findings, [name for name in strange if re.search(mapping["files"], name)], work)
+    recorded = (c for c in columns if c.part not in (ColumnPart.TIME, ColumnPart.LEFT_OUT))
+    mapping |= {**keys, "channel": [_channel(c) for c in recorded]}
+    damaged = dict[str, str]()
+    population = read_csv_folder(source, mapping | _exclusion(list(strange)), damaged=damaged)
+    alone = f"{len(strange)} files are not like the others and left alone: {some(list(strange))}"
+    findings = [f"{alone}; the first {next(iter(strange.values()))}"] if strange else []
+    findings += [f"left out, {name}: {why}" for name, why in damaged.items()]
+    unused = [name for name in (*strange, *damaged) if re.search(mapping["files"], name)]
+    draft = Discovery(mapping, (), tuple(columns), population, notes, tuple(findings))
+    found = _examined(source, draft, unused, fewest, work)
+    retained = read_csv_folder(source, found.mapping)
+    return replace(found, population=retained, reading=_reading(retained, source))
 
 
 def _files(source: Path, expression: str | None) -> dict[str, Path]:
@@ -82,7 +84,7 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
         selects = re.compile(expression or "").search
     except re.error as error:
         raise ConfigError(f"--files {expression!r}: is not a regular expression ({error}); correct it.") from error
-    files = {relative: path for path, relative in csv_files(source)}
+    files = csv_files(source)
     selected = {relative: path for relative, path in files.items() if selects(relative)}
     if not selected:
         problem = f"none of {len(files)} files of recordings matches --files {expression!r}; correct the expression"
@@ -92,8 +94,8 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     return selected
 
 
-def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str]]:
-    """Return how most files are written, those files, and the others."""
+def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], dict[str, str]]:
+    """Return how most files are written, those files, and what is different in the others."""
     paths, heads = list(files.values()), []
     for path in paths[:: max(1, len(paths) // RULE.looked_at)]:
         with suppress(DataError):
@@ -104,111 +106,109 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
     usual = (h for h in heads if (h.dialect, h.fields) == commonest)
     head = max(usual, key=lambda h: sum(map(h.is_numeric, range(len(h.fields)))))  # a sensor may have been off
-    alike = {relative: path for relative, path in files.items() if _fits(path, head)}
-    return head, alike, [relative for relative in files if relative not in alike]
-
-
-def _fits(path: Path, head: TableHead) -> bool:
-    """Tell whether a file has the columns of the others, where they have them."""
-    try:
-        fields, _ = file_fields(path, head.dialect, head.fields)
-    except DataError:
-        return False
-    names, needed = ({split_header(name)[0] for name in of} for of in (fields, head.fields))
-    return needed - {""} <= names if head.dialect.header else len(fields) == len(head.fields)
+    alike, strange = dict[str, Table](), dict[str, str]()
+    for relative, path in files.items():
+        try:
+            table = Table.open(path, head.dialect, head.fields)
+        except DataError as error:
+            strange[relative] = f"cannot be read ({error})"
+            continue
+        names, needed = ({split_header(name)[0] for name in of} for of in (table.fields, head.fields))
+        if needed - {""} <= names if head.dialect.header else len(table.fields) == len(head.fields):
+            alike[relative] = table
+        else:
+            strange[relative] = f"has the columns {list(table.fields)}"
+    return head, alike, strange
 
 
 def _columns(
-    source: Path, head: TableHead, paths: Sequence[Path], period_s: float | None
+    source: Path, head: TableHead, tables: Sequence[Table], period_s: float | None
 ) -> tuple[list[TableColumn], Record, dict[str, str]]:
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
-    described = _described(head)
-    numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields[i]]
-    samples = []
-    for path in paths[:: max(1, len(paths) // RULE.sampled)]:
-        with suppress(DataError):
-            samples.append(_read(path, head, numeric))
-    labels = dict[str, str]()
-    if not period_s and not time_columns([described[i] for i in numeric], samples):
-        labels = label_columns(paths[0], head)  # of several episodes in a file
+    columns = describe(head)
+    numeric = [c for c in columns if head.is_numeric(c.at)]
+    table, samples = _sampled(source, tables, numeric)
+    candidates, labels = time_columns(numeric, samples), dict[str, str]()
+    if not period_s and not candidates:
+        labels = label_columns(table)  # of several episodes in a file
     if labels:
-        whole = _read(paths[0], head, numeric)
-        samples = [whole[:, rows] for rows in stretches(paths[0], head, labels.values())[: RULE.sampled]]
-    samples = [s for s in samples if s.shape[1] > 2]
-    if not samples:
-        _read(paths[0], head, numeric)  # says why not, where it cannot be read
-        problem = "the files looked at have fewer than three rows of numbers"
-        raise DataError(f"Looking at {source}: {problem}; check the folder.")
-    time, keys, notes = None, Record(sample_period_s=period_s), dict[str, str]()
+        texts = [table.texts(table.fields.index(label)) for label in labels.values()]
+        episodes = [rows for _, rows in stretches(texts)][: RULE.sampled]
+        samples = {at: [signals[0][rows] for rows in episodes] for at, signals in samples.items()}
+        candidates = time_columns(numeric, samples)
+    known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), dict[str, str]()
     if not period_s:
-        time, keys, notes = _time(source, head, described, numeric, samples)
-        described[time] = replace(described[time], part=ColumnPart.TIME)
+        time, keys, notes = _time(source, head, columns, candidates, samples)
+        known[time.at] = replace(time, part=ColumnPart.TIME)
     keys |= {"labels": labels} if labels else {}
-    proposed = dict(zip(numeric, propose([described[i] for i in numeric], samples), strict=True))
-    for i, column in enumerate(described):
-        described[i] = proposed.get(i, column if i == time else replace(column, why="no numbers"))
+    for column in columns:
         if column.header in labels.values():
-            described[i] = replace(column, why="says which unit, condition or episode a row belongs to")
-    return [c for c, name in zip(described, head.fields, strict=True) if name], keys, notes
+            known[column.at] = replace(column, why="says which unit, condition or episode a row belongs to")
+    proposed = propose([c for c in numeric if c.at not in known], samples)
+    known = {c.at: c for c in proposed} | known
+    return [known.get(c.at, replace(c, why="no numbers")) for c in columns], keys, notes
 
 
-def _described(head: TableHead) -> list[TableColumn]:
-    """Return the columns by their headers, without parts."""
-    described = list[TableColumn]()
-    for i, (header, unit) in enumerate(zip(head.fields, head.units, strict=True)):
-        column = describe(header or f"column {i + 1}", unit, [c.name for c in described])
-        if not head.dialect.header or head.fields.count(header) > 1:
-            column = replace(column, header=header if head.dialect.header else str(i + 1), number=i + 1)
-        described.append(column)
-    return described
+def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColumn]) -> tuple[Table, Samples]:
+    """Return the first table that can be read, and columns of some that can; what cannot be used is NaN."""
+    spread = tables[:: max(1, len(tables) // RULE.sampled)]
+    places, samples = [c.at for c in columns], dict[Table, Array]()
+    for table in dict.fromkeys((*spread, *tables)):
+        if len(samples) == len(spread):
+            break
+        with suppress(DataError):
+            (values,) = table.numbers(places)
+            if len(values) >= CHECK.samples:
+                samples[table] = np.where(usable(values), values, np.nan).T
+    if not samples:
+        next(tables[0].numbers(places))  # says why not, where it cannot be read
+        problem = "the files have fewer than three rows of numbers; check the folder."
+        raise DataError(f"Looking at {source}: {problem}")
+    return next(iter(samples)), {at: [signals[i] for signals in samples.values()] for i, at in enumerate(places)}
 
 
 def _time(
-    source: Path, head: TableHead, columns: Sequence[TableColumn], numeric: Sequence[int], samples: Sequence[Array]
-) -> tuple[int, Record, dict[str, str]]:
+    source: Path, head: TableHead, columns: Sequence[TableColumn], candidates: Sequence[TableColumn], samples: Samples
+) -> tuple[TableColumn, Record, dict[str, str]]:
     """Return the column of time, the keys of a mapping that describe it, and what they rest on."""
-    candidates = time_columns([columns[i] for i in numeric], samples)
-    texts = [i for i in range(len(columns)) if head.timestamp(i) is not None]
-    if candidates and (not texts or columns[numeric[candidates[0]]].kind == "time"):
-        at = numeric[candidates[0]]
-        scale, why = time_scale(columns[at], float(np.median(np.diff(samples[0][candidates[0]]))))
-        keys: Record = {"time": columns[at].reference}
-        return (at, keys, {}) if scale == 1 else (at, keys | {"time_scale": scale}, {"time_scale": why})
+    stamps = {c: head.timestamp(c.at) for c in columns}
+    texts = [c for c, order in stamps.items() if order is not None]
+    if candidates and (not texts or candidates[0].kind == "time"):
+        time = candidates[0]
+        scale, why = time_scale(time, float(np.median(np.diff(samples[time.at][0]))))
+        keys: Record = {"time": time.reference} | ({"time_unit": time.recorded} if time.recorded else {})
+        return (time, keys, {}) if scale == 1 else (time, keys | {"time_scale": scale}, {"time_scale": why})
     if texts:
-        return texts[-1], {"time": columns[texts[-1]].reference, "timestamp": head.timestamp(texts[-1])}, {}
+        return texts[-1], {"time": texts[-1].reference, "timestamp": stamps[texts[-1]]}, {}
     called = next((c.header for c in columns if c.kind == "time"), None)
     problem = f"{called!r} stands still or runs back in places, as rounded times do" if called else "no column is time"
     found = ", ".join(repr(c.header) for c in columns)
     raise DataError(f"Looking at {source}: {problem}, found the columns {found}; give --period SECONDS.")
 
 
-def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
-    """Read the numeric columns of a file, shape (n_columns, n_rows), NaN where a number cannot be used."""
-    (values,) = read_blocks(path, head.fields, columns, head.dialect)
-    return np.where(usable(values), values, np.nan).T
-
-
 def _channel(column: TableColumn) -> Record:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
-    role, measured = "input" if column.part is ColumnPart.INPUT else "state", column.part is ColumnPart.MEASURED
-    table: Record = {"name": column.name, "column": column.reference, "column_unit": column.recorded}
-    table |= {"role": role, "measured": measured, "unit": column.unit, "scale": column.scale, "offset": column.offset}
-    default = {name: f.default for name, f in ChannelMapping.model_fields.items()} | {"column": column.name}
-    return {key: value for key, value in table.items() if value != default[key]}
+    role, measured = Role.INPUT if column.part is ColumnPart.INPUT else Role.STATE, column.part is ColumnPart.MEASURED
+    named = {} if column.reference == column.name else {"column": column.reference}
+    about = {"unit": column.unit, "column_unit": column.recorded, "scale": column.scale, "offset": column.offset}
+    channel = ChannelMapping(name=column.name, role=role, measured=measured, **named, **about)
+    return channel.model_dump(mode="json", exclude_defaults=True)
 
 
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
     """Return the columns with measured states and inputs as named, where any are named, else as proposed."""
-    decided = list(columns)
-    freed = {ColumnPart.MEASURED: ColumnPart.STATE, ColumnPart.INPUT: ColumnPart.LEFT_OUT}
-    for part, names in ((ColumnPart.MEASURED, wanted.measured), (ColumnPart.INPUT, wanted.inputs)):
+    decided, measured, given = list(columns), ColumnPart.MEASURED, ColumnPart.INPUT
+    for part, names, freed in (
+        (measured, wanted.measured, ColumnPart.STATE),
+        (given, wanted.inputs, ColumnPart.LEFT_OUT),
+    ):
         places = [_place(decided, name) for name in names]
-        if places:
-            decided = [replace(c, part=freed[part]) if c.part is part else c for c in decided]
-        for i in places:
-            decided[i] = replace(decided[i], part=part, why="as named")
-    needed = {ColumnPart.MEASURED: ("a measured state", "--measured"), ColumnPart.INPUT: ("an input", "--input")}
-    for part, (what, option) in needed.items():
+        for i, column in enumerate(decided):
+            if i in places:
+                decided[i] = replace(column, part=part, why="as named")
+            elif places and column.part is part:
+                decided[i] = replace(column, part=freed)
+    for part, what, option in ((measured, "a measured state", "--measured"), (given, "an input", "--input")):
         if not any(c.part is part for c in decided):
             free = [c for c in decided if c.part is not ColumnPart.TIME]
             known = ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in free)
@@ -229,53 +229,51 @@ def _place(columns: Sequence[TableColumn], name: str) -> int:
     raise ConfigError(f"Roles: there is no column {name!r}{hint} The columns are {', '.join(names)}.")
 
 
-def _examined(
-    source: Path, draft: Discovery, findings: list[str], excluded: Sequence[str], work: Work | None
-) -> Discovery:
+def _examined(source: Path, draft: Discovery, excluded: Sequence[str], fewest: int, work: Work | None) -> Discovery:
     """Look at every episode, leave out what cannot be used, and complete the description."""
-    population, mapping, notes = draft.population, draft.mapping, dict(draft.notes)
-    looks = examine(population, work or Work())
+    population, mapping, notes, findings = draft.population, draft.mapping, dict(draft.notes), [*draft.findings]
+    looks = examine(population, fewest, work or Work())
     wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
-    nan = [s for s in good if s.nan]
-    bridged = len(nan) if min((s.n_samples for s in nan), default=0) >= RULE.shortest_piece else 0
-    counts = Counter((s.key.unit, s.key.condition) for s in good if bridged or not s.nan)
+    counts = Counter((s.key.unit, s.key.condition) for s in good)
     if not counts:
-        why = f"{looks[0].key}: {looks[0].wrong or looks[0].nan}"
-        raise DataError(f"Looking at {source}: none of {len(looks)} episodes can be used; {why}.")
-    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]
-    findings += [s.nan for s in nan if not bridged]
-    few = [group for group, n in counts.items() if n < 2]
-    if 2 * len(few) > len(counts) and min(s.n_samples for s in good) >= RULE.pieces * RULE.shortest_piece:
-        mapping = mapping | {"pieces": RULE.pieces}
+        raise DataError(
+            f"Looking at {source}: none of {len(looks)} episodes can be used; {looks[0].key}: {looks[0].wrong}"
+        )
+    files = _files_of(population, source)
+    findings += [f"left out, {files[key]}: {why}" for key, why in wrong.items()]
+    few, shortest = [group for group, n in counts.items() if n < 2], min(s.n_samples for s in good)
+    if 2 * len(few) > len(counts) and shortest >= 2 * fewest:
+        mapping = mapping | {"pieces": int(np.clip(shortest // RULE.shortest_piece, 2, RULE.pieces))}
         notes["pieces"] = "there is one recording for most units and conditions: each is cut into so many episodes"
         few = []
+    if len(few) == len(counts):
+        needs = f"two are needed, of {fewest} samples each; record more, or name files (--files)"
+        raise DataError(f"Looking at {source}: every unit has one episode that can be used, and {needs}.")
     for unit, condition in few:
         wrong |= dict.fromkeys(population.keys(unit, condition), "the only episode of its unit and condition")
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
-    usable_files = {_relative(population, source, key) for key in population.episodes if key not in wrong}
-    paths = {key: _relative(population, source, key) for key in wrong}
-    unusable = [part_of(path, key) if path in usable_files else path for key, path in paths.items()]
+    retained = {path for key, path in files.items() if key not in wrong}
+    unusable = [part_of(files[key], key) if files[key] in retained else files[key] for key in wrong]
     mapping = mapping | _exclusion([*excluded, *unusable])
-    retained = read_csv_folder(source, mapping)
-    prepare, text = _resampling(population, source, good, bridged)
-    reading = _reading(retained, source)
-    return Discovery(mapping, prepare, draft.columns, retained, notes, (*findings, *text), len(nan) > bridged, reading)
+    prepare, text = _resampling(files, good)
+    return replace(draft, mapping=mapping, prepare=prepare, notes=notes, findings=(*findings, *text))
 
 
-def _resampling(
-    population: Population, source: Path, looks: Sequence[EpisodeLook], bridged: int
-) -> tuple[tuple[Record, ...], list[str]]:
+def _resampling(files: Mapping[EpisodeKey, str], looks: Sequence[EpisodeLook]) -> tuple[tuple[Record, ...], list[str]]:
     """Return the step that makes time even or bridges NaN, and a sentence about it; nothing where neither is needed."""
     median, worst = float(np.median([s.period_s for s in looks])), max(looks, key=lambda s: s.uneven)
     period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
     even = not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks)
+    bridged = sum(s.nan for s in looks)
     if even and not bridged:
         return (), []
-    recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
-    text = f"NaN in {bridged} episodes is bridged by straight lines" if even else "time is uneven"
+    ends = (f"{end(s.period_s for s in looks):.4g}" for end in (min, max))
+    recorded = f"(recorded at {' to '.join(dict.fromkeys(ends))} s)"
+    text = "time is uneven" if uneven else "sampling periods differ"
+    text = f"NaN in {bridged} episodes is bridged by straight lines" if even else text
     text += f": all episodes are resampled to a period of {period_s:g} s {recorded}"
     if uneven:
-        where = f"at sample {worst.uneven[1]} of {_relative(population, source, worst.key)}"
+        where = f"at sample {worst.uneven[1]} of {files[worst.key]}"
         text += f", the worst step differs by {worst.uneven[0] * period_s:.3g} s {where}"
     text += f"; where a step is longer than {GAP:g} periods, the longest stretch without such a gap is taken"
     return ({"step": "resample", "period_s": period_s},), [text]
@@ -286,13 +284,14 @@ def _reading(population: Population, source: Path) -> str:
     key, groups = population.episodes[0], sorted({unit.group for unit in population.units if unit.group})
     group = f", group {population.unit(key.unit).group!r} of {some(groups)}" if groups else ""
     parts = f"unit {key.unit!r}, condition {key.condition!r}, episode {key.episode!r}{group}"
-    return f"{_relative(population, source, key)}: {parts}"
+    return f"{_files_of(population, source)[key]}: {parts}"
 
 
 def _exclusion(names: Sequence[str]) -> Record:
     return {"exclude": f"^(?:{'|'.join(quoted(name) for name in dict.fromkeys(names))})$"} if names else {}
 
 
-def _relative(population: Population, source: Path, key: EpisodeKey) -> str:
-    recordings: Any = population.source
-    return Path(recordings.recordings.places[key].path).relative_to(source).as_posix()
+def _files_of(population: Population, source: Path) -> dict[EpisodeKey, str]:
+    """Return the file of every episode, relative to the folder."""
+    places = population.source.recordings.places
+    return {key: places[key].table.path.relative_to(source).as_posix() for key in population.episodes}

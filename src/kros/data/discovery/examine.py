@@ -9,7 +9,17 @@ import numpy as np
 
 from ...core import DataError, Work, frozen
 from ..population import EpisodeKey, Population
-from ..recording import GroupWatch, NonFiniteError, check_episode, check_increasing, copies_among, digest_of, usable
+from ..recording import (
+    CHECK,
+    GroupWatch,
+    NonFiniteError,
+    check_episode,
+    check_increasing,
+    copies_among,
+    digest_of,
+    usable,
+)
+from ..steps import GAP, longest_stretch
 
 
 @frozen
@@ -21,8 +31,8 @@ class DiscoveryRule:
     above: int = 20  # lines that may stand before the header
     looked_at: int = 15  # files whose first lines say how all are written
     sampled: int = 6  # files whose numbers say what columns are
-    pieces: int = 5  # episodes that a single long recording is cut into
-    shortest_piece: int = 200  # samples that each of them needs
+    pieces: int = 5  # episodes that a single long recording is cut into, at most
+    shortest_piece: int = 200  # samples of each of them, where there are more than two
 
 
 RULE = DiscoveryRule()
@@ -34,19 +44,31 @@ class EpisodeLook:
 
     key: EpisodeKey
     wrong: str = ""  # why it cannot be used, or nothing
-    n_samples: int = 0  # that can be used
+    n_samples: int = 0  # that can be used, up to a gap that is too long to be bridged
     period_s: float = np.nan  # typical step of time
     uneven: tuple[float, int] = (0.0, 0)  # largest relative deviation of a step of time, and the sample before it
-    nan: str = ""  # where it holds NaN or infinity, or nothing
+    nan: bool = False  # whether it holds NaN or infinity
     digest: str = ""
 
 
-def examine(population: Population, work: Work) -> list[EpisodeLook]:
+def examine(population: Population, fewest: int, work: Work) -> list[EpisodeLook]:
     """Read every episode once, as it was recorded, and say what is wrong with it alone or beside the others."""
     tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
     looks = [look for group in work.map("look", _look, tasks) for look in group]
     copies = dict(copies_among((s.key, s.digest) for s in looks if s.digest and not s.wrong))
-    return [replace(s, wrong=f"a copy of {copies[s.key]}") if s.key in copies else s for s in looks]
+    median = np.median([s.period_s for s in looks if not s.wrong] or [np.nan])
+    return [replace(s, wrong=s.wrong or _doubts(s, fewest, float(median), copies.get(s.key))) for s in looks]
+
+
+def _doubts(look: EpisodeLook, fewest: int, period_s: float, copy: EpisodeKey | None) -> str:
+    """Return why an episode that can be read cannot be used beside the others, or nothing."""
+    if copy is not None:
+        return f"a copy of {copy}"
+    if look.n_samples < fewest:
+        return f"it has {look.n_samples} samples that can be used, and kros run needs {fewest}"
+    if not 1 / CHECK.ratio < look.period_s / period_s < CHECK.ratio:
+        return f"its sampling period is {look.period_s:g} s, that of most is {period_s:g} s; check its column of time"
+    return ""
 
 
 def _look(population: Population) -> list[EpisodeLook]:
@@ -63,13 +85,14 @@ def _look(population: Population) -> list[EpisodeLook]:
                 far = min(100, len(time) // 2)  # steps at once: single ones may be rounded
                 period = float(np.median(time[far:] - time[:-far])) / far
                 deviation = np.abs(np.diff(time) / period - 1)
-            look = EpisodeLook(key, "", len(values), period, (float(deviation.max()), int(deviation.argmax())))
+            start, stop = longest_stretch(np.asarray(recording.usable(period).time_s), GAP * period)
+            look = EpisodeLook(key, "", stop - start, period, (float(deviation.max()), int(deviation.argmax())))
             check_episode(values, key, population.columns)
             looks[key] = replace(look, digest=digest_of(values))
             watch.add(key, values)
         except NonFiniteError as error:
-            count = int(usable(values).all(axis=1).sum())
-            looks[key] = replace(look, nan=str(error), n_samples=count) if count else EpisodeLook(key, str(error))
+            whole = usable(values).all(axis=1).any()
+            looks[key] = replace(look, nan=True) if whole else EpisodeLook(key, str(error))
         except DataError as error:
             looks[key] = EpisodeLook(key, str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())

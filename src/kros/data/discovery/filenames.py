@@ -1,26 +1,26 @@
 """Unit, condition, episode and group from the names of files, as a regular expression on their paths.
 
-A path is cut into words at ``/ _ - .`` and spaces. What is the same in all paths is text; what differs is told apart
-by the word that it begins with or that stands before it (``run_3``), by what conditions are called, and else by its
-place: units before episodes.
+A path is cut into words. What differs between paths is told apart by the word that it begins with or that stands before
+it (``run_3``), by what conditions are called, and else by its place: units before episodes.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain, groupby
 
-from ...core import Names, frozen
+from ...core import Names
 from ..population import OUTLIERS
+from ..readers.csv_folder import ENDINGS
 
 UNIT, CONDITION, EPISODE, GROUP = "unit", "condition", "episode", "group"
 _WORDS = {
     UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder "
     "pump valve design joint sample specimen antrieb maschine geraet gerät pruefling prüfling einheit anlage moteur "
     "variateur part id",
-    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung "
-    "versuch lauf aufnahme essai mesure meas nr no",
+    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung day "
+    "session versuch lauf aufnahme essai mesure meas nr no",
     CONDITION: "condition cond load config mode case temp last bedingung zustand charge",
 }
 _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words.split()}
@@ -34,37 +34,28 @@ _MEASURE = re.compile(
 )
 _DATE = re.compile(r"^(?:19|20)\d{6}(?:T?\d{4,6})?$")
 _DATE_PARTS = (r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*")  # 2024-05-31
-_ENDING = re.compile(r"(.*?)(\.(?:csv|tsv|txt|dat|parquet|mat|h5|hdf5?|mf4|mdf|tdms|bag|mcap|db3)(?:\.gz)?)$", re.I)
 Roles = list[str | None]
 Cut = list[list[str]]  # words of every path, with what is between them
 
 
-@frozen
-class FileNames:
-    """What the paths of a folder say."""
-
-    pattern: str  # regular expression with the groups `unit`, `condition`, `episode` and `group`, those that are there
-    other: str | None = None  # a second expression that fits as well: episodes of one unit in place of units
-
-
-def infer_names(paths: Sequence[str]) -> FileNames:
-    """Return the expression that tells the files of a folder apart."""
-    parts = [match.groups() if (match := _ENDING.match(p)) else (p, "") for p in paths]
-    endings = sorted({re.escape(ending) for _, ending in parts if ending})
+def infer_names(paths: Sequence[str]) -> tuple[str, str | None]:
+    """Return the expression that tells files apart, and one for episodes of one unit where names do not say which."""
+    ends = [next((ending for ending in ENDINGS if p.lower().endswith(ending)), "") for p in paths]
+    stems = [p[: len(p) - len(ending)] for p, ending in zip(paths, ends, strict=True)]
+    endings = sorted({re.escape(p[len(stem) :]) for p, stem in zip(paths, stems, strict=True)})
     ending = endings[0] if len(endings) == 1 else f"(?:{'|'.join(endings)})"
-    stems = [stem for stem, _ in parts]
     for cut in (_words(stems), _aligned(stems)):
         if cut is None:
             continue
         columns = list(zip(*(p[::2] for p in cut), strict=True))
-        roles, sure = _roles(columns)
+        roles, sure = _roles(columns, max((i for i, mark in enumerate(cut[0][1::2], 1) if "/" in mark), default=0))
         pattern = _pattern(cut, roles, ending)
         if _tells_apart(pattern, paths):
             alone = not sure and roles.count(UNIT) == 1 and not {EPISODE, GROUP} & set(roles)
             numbered = alone and _counts(columns[roles.index(UNIT)])
             episodes: Roles = [EPISODE if role == UNIT else role for role in roles]
-            return FileNames(pattern, _pattern(cut, episodes, ending) if numbered else None)
-    return FileNames(rf"^(?P<unit>.+){ending}$")
+            return pattern, _pattern(cut, episodes, ending) if numbered else None
+    return rf"^(?P<unit>.+){ending}$", None
 
 
 def _counts(words: Sequence[str]) -> bool:
@@ -95,37 +86,39 @@ def _aligned(stems: Sequence[str]) -> Cut | None:
     return [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts] if tail > 0 else None
 
 
-def _roles(columns: list[Names]) -> tuple[Roles, bool]:
-    """Tell what every word is: text, or one of the groups; and whether words said so."""
+def _roles(columns: list[Names], folders: int) -> tuple[Roles, bool]:
+    """Tell what every word is, the first ones of `folders`: text, or one of the groups; and whether words said so."""
     varying = [i for i, c in enumerate(columns) if len(set(c)) > 1]
     roles: Roles = [_by_words(columns, i) if i in varying else None for i in range(len(columns))]
     for i in range(len(columns) - 2):
         if all(re.fullmatch(p, v) for k, p in enumerate(_DATE_PARTS) for v in columns[i + k]):
             roles = [EPISODE if j in varying and i <= j <= i + 2 else role for j, role in enumerate(roles)]
     for i in varying:  # box1/box1_03
-        if roles[i] is None and any(j < i and columns[i] == columns[j] for j in varying):
+        if roles[i] is None and columns[i] in [columns[j] for j in varying if j < i]:
             roles[i] = "other"
     if UNIT not in roles and varying:  # motor00_01 and motor00_02 are two episodes
         same = [i for i, c in enumerate(columns) if i not in varying and re.search(r"\d", c[0])]
         named = next((i for i in same if _by_words(columns, i) == UNIT), None)
         roles = [UNIT if i == named else role for i, role in enumerate(roles)]
     left = [i for i in varying if roles[i] is None]
-    repeated = [i for i in left if len(set(columns[i])) < len(columns[i])]
-    units = [i for i in varying if roles[i] == UNIT] or repeated
+    units = [i for i in varying if roles[i] == UNIT] or [i for i in left if len(set(columns[i])) < len(columns[i])]
     for i in left:  # good/act1, faulty/act3: two labels, and not two units
         if any(j > i and _nested(columns[i], columns[j]) for j in units):
             roles[i] = GROUP
     left = [i for i in left if roles[i] is None]
     if left:
-        _by_place(columns, varying, left, roles)
+        _by_place(columns, folders, varying, left, roles)
     return _contiguous(roles), not left
+
+
+def _numbered(words: Iterable[str]) -> bool:
+    return all(re.search(r"\d", word) for word in words)
 
 
 def _nested(outer: Names, inner: Names) -> bool:
     """Tell whether words without numbers label units: every unit, a numbered word, has one, and a label has several."""
     values, labels = set(inner), set(outer)
-    numbers = [bool(re.search(r"\d", v)) for v in (*values, *labels)]
-    apart = all(numbers[: len(values)]) and not any(numbers[len(values) :])
+    apart = _numbered(values) and not any(_numbered([label]) for label in labels)
     return apart and len(labels) < len(values) == len(set(zip(outer, inner, strict=True)))
 
 
@@ -138,27 +131,28 @@ def _by_words(columns: list[Names], i: int) -> str | None:
         return CONDITION
     plain = {re.sub(r"\d+$", "", v) for v in values}
     before = columns[i - 1][0].lower() if i and len(set(columns[i - 1])) == 1 else ""
-    numbered = plain.pop() if len(plain) == 1 and all(re.search(r"\d", v) for v in values) else ""
+    numbered = plain.pop() if len(plain) == 1 and _numbered(values) else ""
     roles = {_ROLE_OF.get(numbered), _ROLE_OF.get(re.sub(r"s$", "", before))}
     role = next((role for role in _WORDS if role in roles), None)
     return role or (EPISODE if all(_DATE.match(v) for v in columns[i]) else None)
 
 
-def _by_place(columns: list[Names], varying: Sequence[int], left: Sequence[int], roles: Roles) -> None:
+def _by_place(columns: list[Names], folders: int, varying: Sequence[int], left: Sequence[int], roles: Roles) -> None:
     """Set the roles that no word tells: units before conditions before episodes."""
     if UNIT not in roles:  # what differs in every file is no machine, unless nothing else differs
         repeated = [i for i in left if len(set(columns[i])) < len(columns[i]) or varying == [i]]
-        for i in repeated[:1]:
+        # hall1/crane1/run1: the folder of a set of runs
+        above = [i for i in repeated if i < folders and _numbered(columns[i]) and EPISODE in roles[i:]]
+        for i in (above or repeated[:1])[-1:]:
             roles[i] = UNIT
-    for i in left:
-        numbered = [bool(re.search(r"\d", v)) for v in columns[i]]
+    for i in reversed([i for i in left if roles[i] is None]):
         before = UNIT in roles[i + 1 :] and not any(roles[i + 1 : roles.index(UNIT, i + 1)])
-        if roles[i] is None and before and all(numbered):  # batch2/motor7: the batch is part of the name
+        labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
+        roles[i] = UNIT if labels else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
+        if before and _numbered(columns[i]):  # batch2/motor7: the batch is part of the name
             roles[i] = UNIT
-        elif roles[i] is None:
-            labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
-            free: str = UNIT if labels and not before else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
-            roles[i] = CONDITION if before and CONDITION not in roles else free
+        elif before:
+            roles[i] = EPISODE if CONDITION in roles else CONDITION
 
 
 def _contiguous(roles: Roles) -> Roles:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from ...core import Array, frozen
 from ..measures import KINDS, Measure, clean_unit, measure, split_header
+from ..readers.tables import Table, stretches
 from ..recording import CHECK
 
 WORDS = {
@@ -35,10 +36,19 @@ WORDS = {
 }
 _OF_WORD = {word: kind for kind, words in WORDS.items() for word in words.split()}
 UNKNOWN = "not recognised"
+Samples = Mapping[int, Sequence[Array]]  # of columns by their place, from several episodes
 _STATES = ("angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration")
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
 _LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
 _SPELLED = dict(zip("äöüßÄÖÜΔωφθατ", _LETTERS.split(), strict=True))
+
+
+LABELS = {
+    "unit": "unit serial number sn id name device machine motor drive rig sample specimen cell dut uut asset maschine "
+    "geraet seriennummer nr no",
+    "condition": "condition mode zustand",
+    "episode": "episode run trial test experiment cycle repetition measurement versuch messung lauf",
+}
 
 
 class ColumnPart(str, Enum):
@@ -55,7 +65,7 @@ class ColumnPart(str, Enum):
 class TableColumn:
     """A column of the recordings."""
 
-    header: str  # as in the files; the number of the column where there is no header
+    header: str  # as in the files; the number of the column where there is no header, from 1
     name: str  # of the channel
     unit: str = ""  # unit of measure of the channel, after scaling
     scale: float = 1.0  # to the channel
@@ -64,12 +74,13 @@ class TableColumn:
     kind: str = ""  # kind of quantity, or nothing
     part: ColumnPart = ColumnPart.LEFT_OUT
     why: str = ""  # what the proposal rests on
-    number: int | None = None  # of the column, from 1, where its header does not name it alone
+    at: int = 0  # place among the columns
+    alone: bool = True  # whether its header names it alone
 
     @property
     def reference(self) -> str | int:
         """How a mapping names the column."""
-        return self.header if self.number is None else self.number
+        return self.header if self.alone else self.at + 1
 
 
 def identifier(text: str, taken: Collection[str] = ()) -> str:
@@ -84,14 +95,21 @@ def identifier(text: str, taken: Collection[str] = ()) -> str:
     return next(n for n in (name, *numbered) if n not in taken)
 
 
-def describe(header: str, unit: str, taken: Collection[str]) -> TableColumn:
-    """Return a column by its header and the unit that a file states elsewhere, without a part."""
-    stem, written = split_header(header)
-    unit = clean_unit(unit) or clean_unit(written)
-    name = header if header.isidentifier() and not written else stem
-    name = identifier(f"column_{name}" if name.isdigit() else name, taken)
-    known = measure(unit) or Measure(unit, 1.0, 0.0)
-    return TableColumn(header, name, known.si, known.factor, known.offset, unit, kind_of(stem, unit))
+def describe(table: Table) -> list[TableColumn]:
+    """Return the columns that have a header, or all where there is none, without parts."""
+    columns = list[TableColumn]()
+    for i, (header, stated) in enumerate(zip(table.fields, table.units, strict=True)):
+        if not header:
+            continue
+        stem, written = split_header(header)
+        unit = clean_unit(stated) or clean_unit(written)
+        name = header if header.isidentifier() and not written else stem
+        name = identifier(f"column_{name}" if name.isdigit() else name, [c.name for c in columns])
+        known = measure(unit) or Measure(unit, 1.0, 0.0)
+        about = known.si, known.factor, known.offset, unit, kind_of(stem, unit)
+        alone = table.dialect.header and table.fields.count(header) == 1
+        columns.append(TableColumn(header, name, *about, at=i, alone=alone))
+    return columns
 
 
 def _kinds_of(name: str) -> list[str]:
@@ -109,18 +127,22 @@ def kind_of(name: str, unit: str = "") -> str:
     return next(quantities, "") if kind == "other" else kind
 
 
-def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[int]:
+def time_columns(columns: Sequence[TableColumn], samples: Samples) -> list[TableColumn]:
     """Return the columns that may be time, the likeliest first: called so, or increasing evenly, in most samples."""
-    rising = [i for i in range(len(columns)) if samples and np.mean([_rises(s[i]) for s in samples]) > 0.5]
-    called = [i for i in rising if columns[i].kind == "time"]
-    other = [i for i in rising if i not in called and not all(_counts(s[i]) for s in samples)]
-    steps = {i: [np.diff(s[i]) / np.median(np.diff(s[i])) for s in samples] for i in other}
-    return called + [i for i in other if all(np.mean(np.abs(s - 1) < 0.5) > 0.9 for s in steps[i])]
+    rising = [c for c in columns if np.mean([_rises(s) for s in samples[c.at]]) > 0.5]
+    called = [c for c in rising if c.kind == "time"]
+    other = [c for c in rising if c not in called and not all(map(_counts, samples[c.at]))]
+    return called + [c for c in other if all(map(_is_even, samples[c.at]))]
 
 
 def _rises(column: Array) -> bool:
     steps = np.diff(column)
     return bool(len(steps) and np.isfinite(column).all() and np.mean(steps > 0) > 0.99 and (steps >= 0).all())
+
+
+def _is_even(column: Array) -> bool:
+    steps = np.diff(column)
+    return bool(np.mean(np.abs(steps / np.median(steps) - 1) < 0.5) > 0.9)
 
 
 def _counts(column: Array) -> bool:
@@ -137,14 +159,12 @@ def time_scale(column: TableColumn, step: float) -> tuple[float, str]:
     return 1.0, f"a step of {step:g} fits no unit of time: correct time_scale"
 
 
-def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[TableColumn]:
-    """Return the columns with the part that each is likely to have; time is known already."""
+def propose(columns: Sequence[TableColumn], samples: Samples) -> list[TableColumn]:
+    """Return the columns, without that of time, with the part that each is likely to have."""
     proposed = list[TableColumn]()
-    for i, column in enumerate(columns):
-        part, why = column.part, column.why
-        if part is not ColumnPart.TIME:
-            spare = _spare(i, column, samples)
-            part, why = (ColumnPart.LEFT_OUT, spare) if spare else _by_name(column)
+    for column in columns:
+        spare = _spare(column, samples[column.at])
+        part, why = (ColumnPart.LEFT_OUT, spare) if spare else _by_name(column)
         proposed.append(replace(column, part=part, why=why))
     free = [c.kind for c in proposed if c.part is ColumnPart.STATE]
     first = next((kinds for kinds in _FIRST_MEASURED if set(kinds) & set(free)), ())
@@ -152,9 +172,8 @@ def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[Ta
     return [replace(c, part=ColumnPart.MEASURED) if c in measured else c for c in proposed]
 
 
-def _spare(i: int, column: TableColumn, samples: Sequence[Array]) -> str:
+def _spare(column: TableColumn, signals: Sequence[Array]) -> str:
     """Return why a column is not needed, or nothing."""
-    signals = [s[i] for s in samples]
     if all(np.isnan(s).mean() > 0.1 for s in signals):
         return "mostly empty or text"
     ends = {float(end) for s in signals for end in (np.fmin.reduce(s), np.fmax.reduce(s)) if not np.isnan(end)}
@@ -174,3 +193,15 @@ def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
     if column.kind in _STATES:
         return ColumnPart.STATE, f"{column.kind}, by name or unit"
     return ColumnPart.LEFT_OUT, UNKNOWN
+
+
+def label_columns(table: Table) -> dict[str, str]:
+    """Return the columns whose names and values, which change now and then in a file, say that they label rows."""
+    labels = dict[str, str]()
+    for field in table.fields:
+        words = set(identifier(f"{field} ").lower().split("_"))
+        role = next((role for role, known in LABELS.items() if words <= set(known.split())), None)
+        rows = [rows for _, rows in stretches([table.texts(table.fields.index(field))])] if role else []
+        if role and 1 < len(rows) < rows[-1].stop / 10:
+            labels.setdefault(role, field)
+    return labels

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from ...core import Array, ByName, DataError, frozen, shortened
+from ...core.arrays import as_numbers
 from ..population import DEFAULT_CONDITION, Channel, Channels, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
-from ..recording import Recording, Recordings, check_period, title
+from ..recording import Recording, Recordings, check_period, check_structure, title
 
 
 @frozen
@@ -21,9 +22,9 @@ class ArrayRecordings(Recordings):
         for values, _ in self.places.values():
             values.flags.writeable = False
 
-    def read(self, key: EpisodeKey, place: tuple[Array, Array | None]) -> Recording:
-        """Return one episode."""
-        return Recording(key, *place)
+    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
+        """Yield one episode."""
+        yield Recording(key, *self.places[key])
 
 
 def declare_channels(
@@ -101,19 +102,10 @@ def from_arrays(
     declared = declare_channels(channels, states, inputs, measured, "from_arrays")
     columns = columns_in_order(declared)
     order = [declared.index(c) for c in columns]
-    episodes = _episodes(data)
+    episodes = list(_episodes(data))
+    check_structure(columns, [key for key, _ in episodes])  # 1 and "1" are one unit
     places = {key: (np.ascontiguousarray(_samples(key, one, declared)[:, order]), None) for key, one in episodes}
     return assemble(ArrayRecordings(places), columns, units, sample_period_s, metadata)
-
-
-def as_numbers(values: Any) -> Array:
-    """Return an array of doubles; text, complex numbers and dates are refused rather than converted."""
-    array = np.asarray(values)
-    kind = array.dtype.kind
-    mixed = kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in array.ravel().tolist())
-    if mixed or kind not in "biufO":
-        raise TypeError(f"{'text or complex' if mixed else array.dtype} cannot be used as real numbers")
-    return np.asarray(array, dtype=float)
 
 
 def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
@@ -211,9 +203,9 @@ def from_frame(
             raise DataError(f"from_frame: column {name!r} occurs {known.count(name)} times in {known}; rename it.")
     numbers = np.column_stack([_column(frame, c.name) for c in ordered])
     times = None if time is None else _column(frame, time)
-    columns: list[tuple[str | None, str | None]] = [(unit, None), (condition, DEFAULT_CONDITION), (episode, "0")]
+    ids = _ids(frame, unit, None), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0")
     rows: dict[EpisodeKey, list[int]] = {}  # they need not stand together
-    for row, key in enumerate(map(EpisodeKey, *(_ids(frame, *column) for column in columns))):
+    for row, key in enumerate(map(EpisodeKey, *ids)):
         rows.setdefault(key, []).append(row)
     places = {key: (numbers[at], None if times is None else times[at]) for key, at in rows.items()}
     return assemble(ArrayRecordings(places), ordered, sample_period_s=sample_period_s)

@@ -8,8 +8,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
-from itertools import groupby
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,22 +17,12 @@ from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_vali
 
 from ...core import Array, ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
 from ..measures import clean_unit, measure, split_header
-from ..population import (
-    DEFAULT_CONDITION,
-    Channel,
-    Channels,
-    EpisodeKey,
-    Population,
-    Role,
-    Scaling,
-    Unit,
-    columns_in_order,
-)
+from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps
-from ..recording import Recording, Recordings, check_names, some, usable
+from ..recording import Recording, Recordings, some, usable
 from ..steps import STEPS, Scale, Step
 from .formats import FORMATS
-from .tables import TIMESTAMP_SCALE, Dialect, file_fields, read_blocks, read_labels
+from .tables import TIMESTAMP_SCALE, Dialect, Table, stretches
 
 Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
@@ -60,7 +49,7 @@ class UnitMapping(Settings):
     columns: dict[str, Column] = Field({}, description="column by channel, where it is not that of `[[channel]]`")
 
 
-class CsvMapping(Settings):
+class CsvMapping(Dialect):
     r"""How a folder of tables maps to a population; a file that does not match `files` is left alone."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -71,6 +60,7 @@ class CsvMapping(Settings):
     )
     channel: tuple[ChannelMapping, ...] = Field(description="the channels, in any order")
     time: Column | None = Field(None, description="column of time")
+    time_unit: str = Field("", description="of the column of time, as `column_unit` of a channel")
     unit: tuple[UnitMapping, ...] = Field((), description="where one file holds several units")
     time_scale: float = Field(1.0, gt=0, description="factor from the column of time to seconds")
     sample_period_s: float | None = Field(None, gt=0, description="in place of a column of time")
@@ -79,12 +69,6 @@ class CsvMapping(Settings):
         description="regular expression; paths in which it occurs are left out. Behind the path of a file with several "
         "episodes stands which one, such as log.csv#unit/condition/episode",
     )
-    delimiter: str = Field(",", description="between columns; a tab is written `\\t`")
-    header: bool = Field(True, description="false where the first line holds numbers; columns are then given by number")
-    skip_rows: int = Field(0, ge=0, description="lines before the header, or before the first line of numbers")
-    unit_rows: int = Field(0, ge=0, description="lines between the header and the numbers, such as units of measure")
-    decimal: str = Field(".", description="decimal point, for example `,` in files of some countries")
-    encoding: str = Field("utf-8", description="of the text, for example cp1252 or utf-16")
     timestamp: Literal["ymd", "dmy", "mdy"] | None = Field(
         None, description="where time is a timestamp: the order of its date; a time of day alone takes any of them"
     )
@@ -159,11 +143,6 @@ class CsvMapping(Settings):
         return columns_in_order(self.channel)
 
     @property
-    def channels(self) -> Channels:
-        """The population's channels."""
-        return tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in self.ordered)
-
-    @property
     def steps(self) -> tuple[Step, ...]:
         """Scaling as declared per channel, then the mapping's own steps."""
         scales = (Scale((c.name,), c.scale, offset=c.offset) for c in self.ordered if (c.scale, c.offset) != (1, 0))
@@ -178,7 +157,7 @@ class CsvMapping(Settings):
     @property
     def dialect(self) -> Dialect:
         """How its files are written."""
-        return Dialect(self.delimiter, self.header, self.skip_rows, self.decimal, self.encoding, self.unit_rows)
+        return Dialect(**self.model_dump(include=set(Dialect.model_fields)))
 
     def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column:
         """Return where a channel of a unit is read from."""
@@ -222,41 +201,30 @@ _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class FilePlace:
-    """Where an episode is: a file, its columns, the positions of those wanted (time first), rows, and which piece."""
+    """Where an episode is: a table, the columns that are wanted (time first), rows of it, and which piece of these."""
 
-    path: str
-    fields: Names
+    table: Table
     wanted: Columns
-    conversion: tuple[tuple[float, float], ...] = ()  # factor and offset of those wanted, where units differ
-    rows: tuple[int, int] | None = None
-    piece: tuple[int, int] = (0, 1)  # of how many
+    factors: tuple[float, ...]  # to the declared units of measure of those wanted
+    offsets: tuple[float, ...]
+    rows: slice
+    piece: tuple[int, int]  # of how many
 
 
 @frozen
 class CsvRecordings(Recordings):
     """Reads one file at a time; without `time_scale` there is no column of time."""
 
-    dialect: Dialect
     time_scale: float | None
     timestamp: str | None = None
 
     def file(self, place: FilePlace) -> Path:
         """Return the file of an episode."""
-        return Path(place.path)
+        return place.table.path
 
-    def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
-        """Return one episode as recorded."""
-        (values,), (i, n) = self._values(place, np.inf), place.piece
-        values = values if place.rows is None else values[slice(*place.rows)]
-        part = values[i * len(values) // n : (i + 1) * len(values) // n]
-        return self._recording(key, part, part[:1])
-
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
+    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
         """Yield one episode in blocks, unless it is a part of a file."""
         place = self.places[key]
-        if place.piece[1] > 1 or place.rows is not None:
-            yield self(key)
-            return
         first, last, waiting = np.empty(0), np.empty((0, len(place.wanted))), list[Recording]()
         for values in self._values(place, rows):
             yield from waiting
@@ -267,9 +235,11 @@ class CsvRecordings(Recordings):
 
     def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
         """Yield the columns of a file in blocks, in the units of measure that are declared."""
-        factors, offsets = np.array(place.conversion or [(1.0, 0.0)]).T
-        blocks = read_blocks(Path(place.path), place.fields, place.wanted, self.dialect, self.timestamp, rows)
-        return (values * factors + offsets if place.conversion else values for values in blocks)
+        (i, n), whole = place.piece, (place.piece, place.rows) == ((0, 1), slice(None))
+        for values in place.table.numbers(place.wanted, self.timestamp, rows if whole else np.inf):
+            values = values[place.rows]
+            values = values[i * len(values) // n : (i + 1) * len(values) // n]
+            yield values * place.factors + place.offsets
 
     def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
         """Return samples with their time, the first column if there is one, since the `first` of an episode."""
@@ -282,39 +252,54 @@ class CsvRecordings(Recordings):
 
 
 def read_csv_folder(
-    source: Path | str, mapping: CsvMapping | ByName | Path | str, optional: Collection[str] = ()
+    source: Path | str,
+    mapping: CsvMapping | ByName | Path | str,
+    optional: Collection[str] = (),
+    damaged: dict[str, str] | None = None,
 ) -> Population:
-    """Read a folder of CSV files, also gzip-compressed."""
+    """Read a folder of CSV files; those that cannot be used are collected in `damaged`, with the reason, or refused."""
     chosen, source = load_mapping(mapping), Path(source)
-    places = dict[EpisodeKey, FilePlace]()
-    groups = dict[str, str]()
+    dialect, places = chosen.dialect, dict[EpisodeKey, FilePlace]()
+    groups, units_of_measure = dict[str, str](), dict[Column, str]()
     for path, match in _matches(source, chosen):
-        fields, stated = file_fields(path, chosen.dialect, chosen.declared)
-        if optional and not places:
-            chosen = chosen.without(_absent(chosen, fields, optional))
         named = {name: text for name, text in match.groupdict().items() if text}
-        for key, place in _episodes(path, fields, stated, named, chosen):
-            part = part_of(path.relative_to(source).as_posix(), key)
-            if place.rows is not None and chosen.exclude and re.search(chosen.exclude, part):
+        try:
+            table = Table.open(path, dialect, chosen.declared)
+            if optional and not places:
+                chosen = chosen.without(_absent(chosen, table.fields, optional))
+            episodes = list(_episodes(table, named, chosen, units_of_measure))
+        except DataError as error:
+            if damaged is None:
+                raise
+            damaged[match.string] = str(error)
+            continue
+        for key, place in episodes:
+            part = part_of(match.string, key)
+            if place.rows != slice(None) and chosen.exclude and re.search(chosen.exclude, part):
                 continue
             if key in places:
-                twice = f"{key} is in {places[key].path} and in {path}"
+                twice = f"{key} is in {places[key].table.path} and in {path}"
                 raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
-            check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
             places[key], group = place, named.get("group", "")
             if groups.setdefault(key.unit, group) != group:
                 both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
                 raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
     if not places:
-        files, endings = [relative for _, relative in csv_files(source)], ", ".join(ENDINGS[:4])
-        sample = f" of {len(files)} files such as {files[0]!r}" if files else ""
-        actual = f"no file matches files = {chosen.files!r}{sample or f'; there is no file that ends in {endings}'}"
-        raise DataError(f"Reading {source} as csv: {actual}; correct the expression.")
+        raise _nothing(source, chosen)
     time_scale = None if chosen.time is None else chosen.time_scale
-    recordings = CsvRecordings(places, chosen.dialect, time_scale, chosen.timestamp)
-    units = [Unit(unit, group) for unit, group in groups.items()]
-    facts = (chosen.channels, units, chosen.sample_period_s, chosen.metadata)
-    return assemble(recordings, *facts, steps=chosen.steps, scaling=chosen.scaling)
+    recordings = CsvRecordings(places, time_scale, chosen.timestamp)
+    channels = tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in chosen.ordered)
+    facts = ([Unit(unit, group) for unit, group in groups.items()], chosen.sample_period_s, chosen.metadata)
+    return assemble(recordings, channels, *facts, steps=chosen.steps, scaling=chosen.scaling)
+
+
+def _nothing(source: Path, mapping: CsvMapping) -> DataError:
+    """Return why a folder has no episodes."""
+    files, left_out = list(csv_files(source)), "; exclude leaves some out" if mapping.exclude else ""
+    none = f"; there is no file that ends in {', '.join(ENDINGS[:4])}"
+    sample = f" of {len(files)} files such as {files[0]!r}" if files else none
+    actual = f"no file matches files = {mapping.files!r}{sample}{left_out}"
+    return DataError(f"Reading {source} as csv: {actual}; correct the expression.")
 
 
 def part_of(path: str, key: EpisodeKey) -> str:
@@ -323,44 +308,41 @@ def part_of(path: str, key: EpisodeKey) -> str:
 
 
 def _episodes(
-    path: Path, fields: list[str], stated: list[str], named: dict[str, str], mapping: CsvMapping
+    table: Table, named: dict[str, str], mapping: CsvMapping, known: dict[Column, str]
 ) -> Iterator[tuple[EpisodeKey, FilePlace]]:
-    """Yield the episodes of a file, of which its name says some parts."""
-    places = [(unit.suffix, _place(path, fields, stated, mapping, unit)) for unit in mapping.units]
-    for labels, number, rows in _stretches(path, fields, mapping):
+    """Yield the episodes of a file, of which its name says some parts; `known` are units of measure of other files."""
+    places = [(unit.suffix, _places(table, mapping, unit, known)) for unit in mapping.units]
+    for labels, number, rows in _stretches(table, mapping):
         parts = {"unit": "unit", "condition": DEFAULT_CONDITION, "episode": "0", **named, **labels}
         for suffix, place in places:
             for i in range(mapping.pieces):
                 episode = parts["episode"] + number + (f".{i + 1}" if mapping.pieces > 1 else "")
                 key = EpisodeKey(parts["unit"] + suffix, parts["condition"], episode)
-                yield key, replace(place, rows=rows, piece=(i, mapping.pieces))
+                yield key, FilePlace(table, *place, rows, (i, mapping.pieces))
 
 
-def _stretches(
-    path: Path, fields: list[str], mapping: CsvMapping
-) -> Iterator[tuple[dict[str, str], str, tuple[int, int] | None]]:
-    """Yield what columns state of every episode in a file, its number and its rows; None where it is the whole file."""
+def _stretches(table: Table, mapping: CsvMapping) -> Iterator[tuple[dict[str, str], str, slice]]:
+    """Yield what columns state of every episode in a file, its number and its rows."""
     labels, trigger = mapping.labels, mapping.trigger
     if not labels and trigger is None:
-        yield {}, "", None
+        yield {}, "", slice(None)
         return
-    columns = [read_labels(path, fields, _position(path, fields, c), mapping.dialect) for c in labels.values()]
+    columns = [table.texts(_position(table, c)) for c in labels.values()]
     if trigger is not None:
-        (values,) = read_blocks(path, fields, [_position(path, fields, trigger)], mapping.dialect)
+        (values,) = table.numbers([_position(table, trigger)])
         columns.append((values[:, 0] > mapping.threshold).tolist())
-    start, counts = 0, Counter[Any]()
-    for state, rows in groupby(zip(*columns, strict=True)):
-        start, first = start + sum(1 for _ in rows), start
+    counts = Counter[Any]()
+    for state, rows in stretches(columns):
         counts[state] += 1
         if trigger is None or state[-1]:
             number = "" if trigger is None else f".{counts[state]}"
-            yield dict(zip(labels, state, strict=False)), number, (first, start)
+            yield dict(zip(labels, state, strict=False)), number, rows
     if trigger is not None and not any(state[-1] for state in counts):
         problem = f"column {trigger!r} is nowhere above {mapping.threshold:g}"
-        raise DataError(f"Reading {path}: {problem}; lower the threshold, or exclude the file.")
+        raise DataError(f"Reading {table.path}: {problem}; lower the threshold, or exclude the file.")
 
 
-def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
+def _absent(mapping: CsvMapping, fields: Names, optional: Collection[str]) -> set[str]:
     """Return the channels that are not there and need not be: those that are optional, and truths."""
     spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
     known = {*fields, *range(1, len(fields) + 1)}
@@ -368,20 +350,22 @@ def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -
     return absent | {c.name for c in mapping.channel if c.truth_of in absent}
 
 
-def csv_files(source: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the tables below a folder with their relative paths, in order."""
+def csv_files(source: Path) -> dict[str, Path]:
+    """Return the tables below a folder by their relative paths, in order."""
+    files = dict[str, Path]()
     for folder, folders, names in os.walk(source):
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for name in sorted(names):
             if name.lower().endswith(ENDINGS) and not name.startswith("."):
                 path = Path(folder) / name
-                yield path, path.relative_to(source).as_posix()
+                files[path.relative_to(source).as_posix()] = path
+    return files
 
 
 def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match[str]]]:
     """Yield the files that the mapping describes; the others are counted and named."""
     others = []
-    for path, relative in csv_files(source):
+    for relative, path in csv_files(source).items():
         if mapping.exclude and re.search(mapping.exclude, relative):
             continue
         match = re.search(mapping.files, relative)
@@ -394,34 +378,42 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         log.warning(text, len(others), source, mapping.files, some(others))
 
 
-def _place(path: Path, fields: list[str], stated: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
-    """Return where the channels of a unit are in a file."""
-    wanted = [] if mapping.time is None else [(mapping.time, "")]
+def _places(
+    table: Table, mapping: CsvMapping, unit: UnitMapping, known: dict[Column, str]
+) -> tuple[Columns, tuple[float, ...], tuple[float, ...]]:
+    """Return where the channels of a unit are in a file, with factors and offsets to their units of measure."""
+    wanted = [] if mapping.time is None else [(mapping.time, mapping.time_unit)]
     wanted += [(mapping.column(channel, unit), channel.column_unit) for channel in mapping.ordered]
-    numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for (c, _), f in zip(wanted, fields, strict=False))
+    numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for (c, _), f in zip(wanted, table.fields, strict=False))
     if mapping.header and numbered:
-        problem = f"one header line is needed, found numbers in the first line: {fields}"
-        raise DataError(f"Reading {path}: {problem}; put the names of the columns first, or set header = false.")
-    at = tuple(_position(path, fields, *column) for column in wanted)
-    conversion = tuple(_conversion(path, *column, stated[i]) for column, i in zip(wanted, at, strict=True))
-    changed = any(pair != (1.0, 0.0) for pair in conversion)
-    return FilePlace(str(path), tuple(fields), at, conversion if changed else ())
+        problem = f"one header line is needed, found numbers in the first line: {list(table.fields)}"
+        raise DataError(f"Reading {table.path}: {problem}; put the names of the columns first, or set header = false.")
+    at = tuple(_position(table, *column) for column in wanted)
+    pairs = [_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True)]
+    pairs[:1] = pairs[:1] if mapping.timestamp is None else [(1.0, 0.0)]
+    return at, tuple(factor for factor, _ in pairs), tuple(offset for _, offset in pairs)
 
 
-def _conversion(path: Path, column: Column, declared: str, stated: str) -> tuple[float, float]:
+def _conversion(table: Table, at: int, column: Column, declared: str, known: dict[Column, str]) -> tuple[float, float]:
     """Return factor and offset from the unit that a file states of a column to the one that is declared."""
-    declared = declared or (split_header(column)[1] if isinstance(column, str) else "")
-    if not declared or not stated or clean_unit(declared) == stated:
+    stated, declared = table.units[at], declared or split_header(str(column))[1]
+    usual = declared or (known.setdefault(column, stated) if stated else "")
+    if not stated or clean_unit(usual) == stated:
         return 1.0, 0.0
-    ours, theirs = measure(declared), measure(stated)
-    if ours is None or theirs is None or ours.si != theirs.si:
-        problem = f"column {column!r} is in {stated!r}, and declared in {declared!r}"
-        raise DataError(f"Reading {path}: {problem}; correct the file, or column_unit.")
+    ours, theirs = measure(usual), measure(stated)
+    if not declared and (None in (ours, theirs) or ours == theirs):
+        return 1.0, 0.0
+    if not declared or ours is None or theirs is None or ours.si != theirs.si:
+        problem = (
+            f"column {column!r} is in {stated!r}, and {'declared' if declared else 'in another file'} in {usual!r}"
+        )
+        raise DataError(f"Reading {table.path}: {problem}; correct the file, or column_unit (time_unit).")
     return theirs.factor / ours.factor, (theirs.offset - ours.offset) / ours.factor
 
 
-def _position(path: Path, fields: list[str], column: Column, unit: str = "") -> int:
+def _position(table: Table, column: Column, unit: str = "") -> int:
     """Return the position of a column by number or name; a declared unit may differ from that in the header."""
+    fields = list(table.fields)
     places = [i for i, field in enumerate(fields) if column in (field, i + 1)]
     name, written = split_header(str(column))
     if not places and (unit or written):
@@ -433,4 +425,4 @@ def _position(path: Path, fields: list[str], column: Column, unit: str = "") -> 
         problem = f"column {column} is asked for, found {len(fields)} columns"
     elif places:
         problem = f"column {column!r} occurs {len(places)} times, found {fields}"
-    raise DataError(f"Reading {path}: {problem}; correct the mapping or the file.")
+    raise DataError(f"Reading {table.path}: {problem}; correct the mapping or the file.")

@@ -1,7 +1,6 @@
 """Recordings in the files of measurement programs, each as tables of columns that share their samples.
 
-A format is a function that yields signals by name, nested as in the file, and their units of measure; `FORMATS` names
-it, and the extra that installs what it needs, by the end of a file's name. Text is read in blocks, by `tables`.
+A format is a function that yields signals by name, nested as in the file, and their units of measure.
 """
 
 from __future__ import annotations
@@ -104,6 +103,7 @@ def _arrow(path: Path) -> Iterator[Group]:
     yield {name: s.astype(str) if s.dtype == object else s for name, s in signals.items()}, units
 
 
+# by the end of a file's name, with the extra that installs what it needs
 FORMATS: dict[str, tuple[Callable[[Path], Iterator[Group]], str]] = {
     ".mat": (_matlab, "mat73"),
     **dict.fromkeys((".parquet", ".feather"), (_arrow, "")),
@@ -125,25 +125,25 @@ def columns_of(path: Path, wanted: Collection[str | int | None] = ()) -> dict[st
     return tables[_chosen(path, tables, wanted)]
 
 
+def signals_of(path: Path, names: Sequence[str]) -> list[Array]:
+    """Return columns of one table of a file, as they are."""
+    version = stamp_of(path)
+    table = _tables(path, version)[_chosen(path, _heads(path, version), names)]
+    return [table[name][0] for name in names]
+
+
 def values_of(path: Path, names: Sequence[str]) -> Array:
     """Return columns of one table of a file, shape (n_samples, len(names))."""
-    table = _table(path, names)
     try:
-        return np.column_stack([table[name][0].astype(float) for name in names])
+        return np.column_stack([signal.astype(float) for signal in signals_of(path, names)])
     except ValueError as error:  # a column of text
         raise DataError(f"Reading {path}: {error}; declare columns of numbers.") from error
 
 
 def texts_of(path: Path, name: str) -> list[str]:
     """Return a column of a file as text."""
-    values = _table(path, [name])[name][0]
+    (values,) = signals_of(path, [name])
     return [str(value).strip() if values.dtype.kind == "U" else f"{value:g}" for value in values]
-
-
-def _table(path: Path, wanted: Sequence[str]) -> dict[str, tuple[Array, str]]:
-    """Return the table of a file that holds the wanted columns."""
-    version = stamp_of(path)
-    return _tables(path, version)[_chosen(path, _heads(path, version), wanted)]
 
 
 def _chosen(path: Path, tables: Sequence[Mapping[str, str]], wanted: Collection[str | int | None]) -> int:

@@ -49,10 +49,7 @@ EPISODE = r"[^/]*(?=\d{3}\.csv$)0{0,2}(?P<episode>\d{1,3})\.csv"  # the last thr
 MAPPING = CsvMapping(
     files=f"^(?P<group>{'|'.join(GROUPS)})/{FOLDER}/{EPISODE}$",
     time=1,
-    channel=tuple(
-        ChannelMapping(name=c.name, role=c.role, unit=c.unit, measured=c.measured, column=number)
-        for number, c in enumerate(CHANNELS, start=2)
-    ),
+    channel=tuple(ChannelMapping(**vars(c), column=number) for number, c in enumerate(CHANNELS, start=2)),
     prepare=STEPS,
     metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
 )
@@ -79,8 +76,8 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     root, what = find_root(Path(source)), f"Reading {source} as motor-drive-raw"
     if root is None:
         missing = "found no folder 'population' or 'outliers', nor 'batch_b' with one of them"
-        raise DataError(f"{what}: {missing}; check the path.")
-    files = [name for _, name in csv_files(root) if name.endswith(".csv") and name.startswith(GROUPS)]
+        raise DataError(f"{what}: {missing}; check the path, or set another data.reader.")
+    files = [name for name in csv_files(root) if name.endswith(".csv") and name.startswith(GROUPS)]
     strange = next((name for name in files if not re.search(MAPPING.files, name)), None)
     if strange is not None:
         wanted = "<YYYYmmddTHHMMSS>_<serial, 6 digits>_<load|noload>/*_<episode, 3 digits>.csv"

@@ -24,7 +24,7 @@ def detect_reader(source: Path | str) -> str | None:
         return "parquet"
     if is_raw_layout(source):
         return "motor-drive-raw"
-    return "csv" if any(True for _ in csv_files(source)) else None
+    return "csv" if csv_files(source) else None
 
 
 def read(
@@ -98,7 +98,10 @@ def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
         raise DataError(f"{reading}: this is a file, and recordings are a folder; give the folder that holds it.")
     if not any(source.iterdir()):
         raise DataError(f"{reading}: the folder is empty; check data.source or record something.")
-    chosen = "csv" if reader is None and with_mapping else reader or detect_reader(source)  # a mapping takes any layout
+    fits = detect_reader(source)
+    chosen = "csv" if reader is None and with_mapping else reader or fits  # a mapping takes any layout
+    if chosen != "csv" and fits not in (chosen, "csv", None):
+        raise DataError(f'{reading} as {chosen}: these are {fits} recordings; set data.reader = "{fits}".')
     if chosen is None:
         problem = "it has neither population.json, nor 'population' and 'outliers', nor CSV files"
         raise DataError(f"{reading}: no reader fits; {problem}; check data.source.")

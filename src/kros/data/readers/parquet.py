@@ -50,12 +50,7 @@ class ParquetRecordings(Recordings):
         """Return the file of a unit and condition."""
         return Path(self.folder) / place[0]
 
-    def read(self, key: EpisodeKey, place: Place) -> Recording:
-        """Return one episode."""
-        (recording,) = self.blocks(key)
-        return recording
-
-    def blocks(self, key: EpisodeKey, rows: int | None = None) -> Iterator[Recording]:
+    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
         """Yield an episode whole, or in blocks of at most `rows` samples."""
         place = self.places[key]
         path = self.file(place)
@@ -73,14 +68,14 @@ class ParquetRecordings(Recordings):
             raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; {AGAIN}.") from error
 
 
-def _tables(path: Path, place: Place, columns: list[str], rows: int | None) -> Iterator[Any]:
+def _tables(path: Path, place: Place, columns: list[str], rows: float) -> Iterator[Any]:
     """Yield columns of a row group after checks of length and types, pages against their checksums."""
     import pyarrow as pa
     from pyarrow import parquet
 
     _, group, samples = place
     options: Record = {"pre_buffer": False, "page_checksum_verification": True}
-    options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
+    options |= {"memory_map": True} if rows == np.inf else {"buffer_size": BLOCK}
     with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:
         actual, schema = file.metadata.row_group(group).num_rows, file.schema_arrow
         if actual != samples:
@@ -91,10 +86,10 @@ def _tables(path: Path, place: Place, columns: list[str], rows: int | None) -> I
         if wrong:
             problem = f"column {wrong[0]!r} should hold {'text' if wrong[0] in KEYS else 'numbers of type double'}"
             raise DataError(f"Reading {path}: {problem}, found {kinds[wrong[0]]}; files were changed, {AGAIN}.")
-        if rows is None:
+        if rows == np.inf:
             yield file.read_row_group(group, columns=columns, use_threads=False)
             return
-        for part in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
+        for part in file.iter_batches(int(rows), row_groups=[group], columns=columns, use_threads=False):
             yield pa.Table.from_batches([part])
 
 

@@ -10,12 +10,14 @@ import zlib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from pydantic import Field
 
-from ...core import AnyArray, Array, DataError, limits
+from ...core import AnyArray, Array, DataError, Names, Settings, limits
 from ...core.files import pass_on_shortage, require_regular, shortened
 from ..measures import clean_unit, is_unit_row, split_header
 from .formats import columns_of, is_binary, texts_of, values_of
@@ -29,23 +31,98 @@ _STAMP = r"^\s*(?P<whole>.*?\d{1,2}:\d{2}:\d{2})(?:[.,:](?P<fraction>\d{1,9}))?\
 ORDERS = ("ymd", "dmy", "mdy")  # of the date in a timestamp
 
 
+class Dialect(Settings):
+    """How a text file is written."""
+
+    delimiter: str = Field(",", description="between columns; a tab is written `\\t`")
+    header: bool = Field(True, description="false where the first line holds numbers; columns are then given by number")
+    skip_rows: int = Field(0, ge=0, description="lines before the header, or before the first line of numbers")
+    unit_rows: int = Field(0, ge=0, description="lines between the header and the numbers, such as units of measure")
+    decimal: str = Field(".", description="decimal point, for example `,` in files of some countries")
+    encoding: str = Field("utf-8", description="of the text, for example cp1252 or utf-16")
+
+
 @dataclass(frozen=True)
-class Dialect:
-    """How a text file is written: delimiter, whether a line names the columns, lines before it, decimal point, ..."""
+class Table:
+    """A table in a file."""
 
-    delimiter: str = ","
-    header: bool = True
-    skip_rows: int = 0
-    decimal: str = "."
-    encoding: str = "utf-8"
-    unit_rows: int = 0  # lines between the header and the numbers
+    path: Path
+    dialect: Dialect  # of a text file
+    fields: Names  # names of the columns, or the first numbers where there is no header
+    units: Names  # units of measure that it states
+
+    @classmethod
+    def open(cls, path: Path, dialect: Dialect, wanted: Collection[str | int | None] = ()) -> Table:
+        """Return the table of a file, of several the one that holds the wanted columns."""
+        if is_binary(path):
+            columns = columns_of(path, wanted)
+            return cls(path, dialect, tuple(columns), tuple(map(clean_unit, columns.values())))
+        fields, units = _columns(path, dialect)
+        return cls(path, dialect, tuple(fields), tuple(map(clean_unit, units)))
+
+    def numbers(self, columns: Sequence[int], timestamp: str | None = None, rows: float = np.inf) -> Iterator[Array]:
+        """Yield some columns in blocks of at least `rows`; the first may be timestamps, as microseconds."""
+        if is_binary(self.path):
+            yield values_of(self.path, [self.fields[i] for i in columns])
+            return
+        waiting = [np.empty((0, len(columns)))]
+        for time, *others in self._batches(columns, () if timestamp is None else columns[:1]):
+            first = to_numpy(time) if timestamp is None else microseconds(time, timestamp)
+            part = np.column_stack([first, *map(to_numpy, others)])
+            if len(part) > 1 and sum(map(len, waiting)) >= rows:
+                yield np.concatenate(waiting)
+                waiting = []
+            waiting.append(part)
+        yield np.concatenate(waiting)
+
+    def texts(self, column: int) -> list[str]:
+        """Return a column as text."""
+        if is_binary(self.path):
+            return texts_of(self.path, self.fields[column])
+        return [str(text).strip() for (texts,) in self._batches([column], [column]) for text in texts.to_pylist()]
+
+    def _batches(self, wanted: Sequence[int], texts: Collection[int]) -> Iterator[list[Any]]:
+        """Yield columns as Arrow arrays of numbers, or of texts."""
+        import pyarrow as pa
+        from pyarrow import csv as arrow
+
+        names, dialect = [str(i) for i in range(len(self.fields))], self.dialect
+        kinds = {names[i]: pa.string() if i in texts else pa.float64() for i in wanted}
+        lines = dialect.skip_rows + (1 + dialect.unit_rows if dialect.header else 0)
+        options = (
+            arrow.ReadOptions(use_threads=False, column_names=names, block_size=BLOCK, skip_rows=lines),
+            arrow.ParseOptions(delimiter=dialect.delimiter),
+            arrow.ConvertOptions(
+                column_types=kinds,
+                include_columns=list(kinds),
+                decimal_point=dialect.decimal,
+                null_values=[*arrow.ConvertOptions().null_values, *ABSENT],
+            ),
+        )
+        try:
+            with opened(self.path, dialect.encoding) as file:
+                for batch in arrow.open_csv(pa.PythonFile(file, mode="r"), *options):
+                    yield [batch.column(names[i]) for i in wanted]
+        except DataError:
+            raise
+        except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
+            raise self._error(error) from error
+
+    def _error(self, error: Exception) -> DataError:
+        """Return what Arrow says about the file, with the name of a column in place of its number from zero."""
+
+        def name(match: re.Match[str]) -> str:
+            at = int(match[1])
+            return f"in column {self.fields[at] if self.dialect.header else at + 1!r}:"
+
+        pass_on_shortage(error, self.path)
+        text = shortened(re.sub(r"In CSV column #(\d+):", name, str(error)))
+        text = f"a line, or a text in quotes, is longer than {BLOCK} bytes" if "straddling" in text else text
+        return DataError(f"Reading {self.path}: {text}; correct the file, or the mapping.")
 
 
-def file_fields(path: Path, dialect: Dialect, wanted: Collection[str | int | None] = ()) -> tuple[list[str], list[str]]:
-    """Return the names of a table's columns, or the first numbers where it has no header, and the units it states."""
-    if is_binary(path):
-        columns = columns_of(path, wanted)
-        return list(columns), [clean_unit(unit) for unit in columns.values()]
+def _columns(path: Path, dialect: Dialect) -> tuple[list[str], list[str]]:
+    """Return the names of the columns of a text file, and the units that it states."""
     needed = dialect.skip_rows + dialect.unit_rows + 2
     lines = lines_of(head_of(path, 1000 * needed), dialect.encoding, path)
     lines = (lines if len(lines) > needed else lines_of(head_of(path), dialect.encoding, path))[dialect.skip_rows :]
@@ -63,7 +140,7 @@ def file_fields(path: Path, dialect: Dialect, wanted: Collection[str | int | Non
     spare = (*fields[width:], *(rows[-1][len(fields) :] if width > len(fields) else ()))  # of delimiters at line ends
     fields = fields if width < 2 or any(spare) else (fields + [""] * width)[:width]
     units = next(filter(is_unit_row, rows[: dialect.unit_rows]), [split_header(name)[1] for name in fields])
-    return fields, [clean_unit(unit) for unit in (units + [""] * len(fields))[: len(fields)]]
+    return fields, (units + [""] * len(fields))[: len(fields)]
 
 
 def head_of(path: Path, size: int = HEAD) -> bytes:
@@ -96,80 +173,12 @@ def cells_of(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
 
 
-def read_blocks(
-    path: Path,
-    fields: Sequence[str],
-    wanted: Sequence[int],
-    dialect: Dialect,
-    timestamp: str | None = None,
-    rows: float = np.inf,
-) -> Iterator[Array]:
-    """Yield some columns of a table in blocks of at least `rows`; the first may be timestamps, as microseconds."""
-    if is_binary(path):
-        yield values_of(path, [fields[i] for i in wanted])
-        return
-    waiting = [np.empty((0, len(wanted)))]
-    for columns in _batches(path, fields, wanted, dialect, () if timestamp is None else wanted[:1]):
-        first = [] if timestamp is None else [microseconds(columns.pop(0), timestamp)]
-        part = np.column_stack([*first, *map(to_numpy, columns)])
-        if len(part) > 1 and sum(map(len, waiting)) >= rows:
-            yield np.concatenate(waiting)
-            waiting = []
-        waiting.append(part)
-    yield np.concatenate(waiting)
-
-
-def read_labels(path: Path, fields: Sequence[str], column: int, dialect: Dialect) -> list[str]:
-    """Return a column as text."""
-    if is_binary(path):
-        return texts_of(path, fields[column])
-    batches = _batches(path, fields, [column], dialect, [column])
-    return [str(text).strip() for (labels,) in batches for text in labels.to_pylist()]
-
-
-def _batches(
-    path: Path, fields: Sequence[str], wanted: Sequence[int], dialect: Dialect, texts: Collection[int]
-) -> Iterator[list[Any]]:
-    """Yield columns of a table as Arrow arrays of numbers, or of texts."""
-    import pyarrow as pa
-    from pyarrow import csv as arrow
-
-    names = [str(i) for i in range(len(fields))]
-    kinds = {names[i]: pa.string() if i in texts else pa.float64() for i in wanted}
-    lines = dialect.skip_rows + (1 + dialect.unit_rows if dialect.header else 0)
-    options = (
-        arrow.ReadOptions(use_threads=False, column_names=names, block_size=BLOCK, skip_rows=lines),
-        arrow.ParseOptions(delimiter=dialect.delimiter),
-        arrow.ConvertOptions(
-            column_types=kinds,
-            include_columns=list(kinds),
-            decimal_point=dialect.decimal,
-            null_values=[*arrow.ConvertOptions().null_values, *ABSENT],
-        ),
-    )
-    with _explained(path, fields, dialect), opened(path, dialect.encoding) as file:
-        for batch in arrow.open_csv(pa.PythonFile(file, mode="r"), *options):
-            yield [batch.column(names[i]) for i in wanted]
-
-
-@contextmanager
-def _explained(path: Path, fields: Sequence[str], dialect: Dialect) -> Iterator[None]:
-    """Turn what Arrow says about a file into one error, with the name of a column in place of its number from zero."""
-    import pyarrow as pa
-
-    def name(match: re.Match[str]) -> str:
-        at = int(match[1])
-        return f"in column {fields[at] if dialect.header else at + 1!r}:"
-
-    try:
-        yield
-    except DataError:
-        raise
-    except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
-        pass_on_shortage(error, path)
-        text = shortened(re.sub(r"In CSV column #(\d+):", name, str(error)))
-        text = f"a line, or a text in quotes, is longer than {BLOCK} bytes" if "straddling" in text else text
-        raise DataError(f"Reading {path}: {text}; correct the file, or the mapping.") from error
+def stretches(columns: Sequence[Sequence[Any]]) -> Iterator[tuple[tuple[Any, ...], slice]]:
+    """Yield what columns hold where they stay the same, and these rows."""
+    start = 0
+    for state, rows in groupby(zip(*columns, strict=True)):
+        start, first = start + sum(1 for _ in rows), start
+        yield state, slice(first, start)
 
 
 class LimitedFile:

@@ -48,51 +48,50 @@ _CANDIDATES = 64
 _TRIES = 1000
 
 
-def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int, period_s: float) -> tuple[Array, Array]:
+def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int) -> tuple[Array, Array]:
     """Return target position and velocity of an episode, each of shape (n_rest + n_samples,), in rad and rad/s."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(REFERENCE_STREAM, episode)))
-    checkpoints = _draw_checkpoints(rng, n_samples, period_s)
-    durations = _durations(checkpoints, period_s)
+    checkpoints = _draw_checkpoints(rng, n_samples)
+    durations = _lengths(checkpoints) + _RAMPS
     spare = n_samples - SETTLE_SAMPLES - durations.sum()  # spread as rests at the checkpoints
     rests = spare * rng.dirichlet(np.ones(len(durations) + 1))[:-1]
     starts = SETTLE_SAMPLES + np.cumsum(rests) + np.concatenate([[0.0], np.cumsum(durations[:-1])]) + n_rest
-    return profile(checkpoints, starts, n_rest + n_samples, period_s)
+    return profile(checkpoints, starts, n_rest + n_samples)
 
 
-def profile(checkpoints: Array, starts: Array, n_samples: int, period_s: float) -> tuple[Array, Array]:
+def profile(checkpoints: Array, starts: Array, n_samples: int) -> tuple[Array, Array]:
     """Move from checkpoint to checkpoint, leaving each at a sample; position and velocity, (n_samples,), rad, rad/s."""
-    lengths = np.abs(np.diff(checkpoints)) / (MAX_SPEED * period_s)
-    knots = np.stack([starts, starts + lengths], axis=1).ravel()
+    knots = np.stack([starts, starts + _lengths(checkpoints)], axis=1).ravel()
     ramp = np.interp(np.arange(-_RAMPS, n_samples + 1), knots, np.repeat(checkpoints, 2)[1:-1])
     for length in (ACCELERATION_SAMPLES, JERK_SAMPLES):
         total = np.cumsum(np.concatenate([np.zeros(length), ramp - ramp[0]]))  # before the start its value is held
         ramp = ramp[0] + (total[length:] - total[:-length]) / length
     position = ramp[_RAMPS:]
     velocity = np.diff(ramp[_RAMPS - 1 :])
-    velocity = 0.5 * (velocity[:-1] + velocity[1:]) / period_s
+    velocity = 0.5 * (velocity[:-1] + velocity[1:]) / SAMPLE_PERIOD_S
     return position[:-1].copy(), velocity
 
 
-def _durations(checkpoints: Array, period_s: float) -> Array:
-    """Samples that each move takes."""
-    return np.abs(np.diff(checkpoints, axis=-1)) / (MAX_SPEED * period_s) + _RAMPS
+def _lengths(checkpoints: Array) -> Array:
+    """Samples that each move takes at full speed."""
+    return np.abs(np.diff(checkpoints)) / (MAX_SPEED * SAMPLE_PERIOD_S)
 
 
-def _draw_checkpoints(rng: np.random.Generator, n_samples: int, period_s: float) -> Array:
+def _draw_checkpoints(rng: np.random.Generator, n_samples: int) -> Array:
     """Draw a start and checkpoints within one revolution in either direction that fit into the episode."""
-    seconds = n_samples * period_s
+    seconds = n_samples * SAMPLE_PERIOD_S
     n_moves = max(2, round(seconds / SECONDS_PER_CHECKPOINT))
     for _ in range(_TRIES):
-        drawn = _candidates(rng, n_moves, _RAMPS * MAX_SPEED * period_s)
-        good = _fits(drawn, n_samples, period_s)
+        drawn = _candidates(rng, n_moves)
+        good = _fits(drawn, n_samples)
         if good.any():
             return drawn[np.argmax(good)]
     raise ConfigError(f"Drawing {n_moves} checkpoints for {seconds:g} s: none fit; ask for seconds >= 2.")
 
 
-def _candidates(rng: np.random.Generator, n_moves: int, shortest: float) -> Array:
-    """Draw sequences of checkpoints, neighbours at least `shortest` apart, shape (n_candidates, n_moves + 1)."""
-    drawn = np.empty((_CANDIDATES, n_moves + 1))
+def _candidates(rng: np.random.Generator, n_moves: int) -> Array:
+    """Draw checkpoints, so far apart that full speed is reached, shape (n_candidates, n_moves + 1)."""
+    drawn, shortest = np.empty((_CANDIDATES, n_moves + 1)), _RAMPS * MAX_SPEED * SAMPLE_PERIOD_S
     drawn[:, 0] = rng.uniform(-REVOLUTION, REVOLUTION, _CANDIDATES)
     for j in range(n_moves):
         here = drawn[:, j]
@@ -103,12 +102,11 @@ def _candidates(rng: np.random.Generator, n_moves: int, shortest: float) -> Arra
     return drawn
 
 
-def _fits(drawn: Array, n_samples: int, period_s: float) -> Flags:
+def _fits(drawn: Array, n_samples: int) -> Flags:
     """Tell which candidates fill the episode without overrunning it and hold full speed in both directions."""
-    total = _durations(drawn, period_s).sum(axis=1) + SETTLE_SAMPLES
-    moves = np.diff(drawn, axis=1) / (MAX_SPEED * period_s)
-    held = _RAMPS + LEAST_HOLD_SAMPLES
-    both = (moves.max(axis=1) >= held) & (moves.min(axis=1) <= -held)
+    lengths, forward, held = _lengths(drawn), np.diff(drawn) > 0, _RAMPS + LEAST_HOLD_SAMPLES
+    total = (lengths + _RAMPS).sum(axis=1) + SETTLE_SAMPLES
+    both = np.any((lengths >= held) & forward, axis=1) & np.any((lengths >= held) & ~forward, axis=1)
     return (total <= n_samples) & (total >= LEAST_IN_MOTION * n_samples) & both
 
 
@@ -197,15 +195,16 @@ class HarmonicDrivePopulation(BatchSettings):
         keys = tuple(EpisodeKey(u.id, c, str(e)) for u in units for c in conditions for e in range(self.n_episodes))
         row, condition, episode = np.unravel_index(np.arange(len(keys)), (len(units), len(conditions), self.n_episodes))
         loaded = np.array([c == "load" for c in conditions], float)[condition]
-        samples, loop = (round(self.seconds / SAMPLE_PERIOD_S) + 1, REST_SAMPLES, SAMPLE_PERIOD_S), Loop(self.loop)
-        inputs = [np.stack(episode_reference(self.seed, e, *samples)) for e in range(self.n_episodes)]
+        samples, loop = round(self.seconds / SAMPLE_PERIOD_S) + 1, Loop(self.loop)
+        inputs = [np.stack(episode_reference(self.seed, e, samples, REST_SAMPLES)) for e in range(self.n_episodes)]
         position, velocity = np.stack(inputs, axis=1)
         states, true, torque = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
+        parts = dict[EpisodeKey, tuple[Array, Array, Array]]()
         for i, key in enumerate(keys):  # what the recording adds: an offset of the position, noise on the current
             rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
             states[i, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
             states[i, 2] += CURRENT_NOISE * rng.standard_normal(states.shape[-1])
-        parts = {key: (states[i], inputs[episode[i]], true[i]) for i, key in enumerate(keys)}
+            parts[key] = states[i], inputs[episode[i]], true[i]
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}

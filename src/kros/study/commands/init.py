@@ -14,7 +14,7 @@ from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.recording import check_population
 from ...identify.survey import UNLOADED, survey
 from ..config import study_schema, validate_config
-from ..stages.learning import FEWEST, open_source
+from ..stages.learning import FEWEST, fewest_samples, open_source
 from .mapping_text import comment, key_lines, mapping_lines
 
 
@@ -24,7 +24,7 @@ def study_text(source: Path, data: ByName, discovery: Discovery | None, findings
     lines = [f"#:schema ./{SCHEMA}", *comment(written)]
     if findings:
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in comment(f"- {text}"))]
-    lines += ["", "[data]", *key_lines({key: data[key] for key in ("source", "reader", "on_nan") if key in data})]
+    lines += ["", "[data]", *key_lines({key: data[key] for key in ("source", "reader")})]
     identify_on = key_lines({"identify_on": data.get("identify_on", "...")})[0]
     prefix = "" if "identify_on" in data else "# "
     lines += [f"{prefix}{identify_on}  # condition that models and observers are made from, where there are several"]
@@ -60,9 +60,8 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
             )
         data: Record = {"source": _source(source, out), "reader": reader}
     else:
-        discovery = discover(source, wanted, work)
+        discovery = discover(source, wanted, work, fewest_samples())
         data = {"source": _source(source, out), "reader": "csv", "csv": discovery.mapping}
-        data |= {"on_nan": "drop_episode"} if discovery.drop_nan else {}
         data |= {"prepare": list(discovery.prepare)} if discovery.prepare else {}
     folder = out.parent.absolute()
     population = open_source(validate_config({"data": dict(data)}, folder, str(out)))
@@ -71,7 +70,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     findings = list(discovery.findings if discovery else ())
     try:
         check_population(population, allow_single=True)
-        population, facts = survey(population, work, identify_on=unloaded, on_nan=data.get("on_nan", "error"))
+        population, facts = survey(population, work, identify_on=unloaded, fewest=fewest_samples())
         findings += facts.alerts
     except DataError as error:
         findings.append(f"kros run would refuse this: {error}")

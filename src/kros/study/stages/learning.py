@@ -26,6 +26,11 @@ PARQUET, ARRAYS = "parquet", "arrays"
 FEWEST = 2  # units that a population is learned from
 
 
+def fewest_samples(history: int = 0) -> int:
+    """Return how many samples every episode needs after preparation, for a lifting with delays up to `history`."""
+    return FEWEST_SAMPLES + 1 + history
+
+
 def open_source(config: StudyConfig, given: Population | None = None) -> Population:
     """Open the study's recordings, or take those that are given, prepared and without excluded units."""
     data = config.data
@@ -81,7 +86,7 @@ def run_read(context: Context) -> None:
     population, data = open_source(config, context.given), config.data
     lifting = resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
     options = {"test": config.split.test, "identify_on": data.identify_on, "on_nan": data.on_nan}
-    fewest, reserve = FEWEST_SAMPLES + 1 + lifting.history, draw(config, population)
+    fewest, reserve = fewest_samples(lifting.history), draw(config, population)
     _, facts = survey(population, context.work, copy, reserve=reserve, fewest=fewest, **options)
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")

@@ -6,9 +6,9 @@ For every form, with the perturbed plant in it (`observer_problem`) and the obse
                |                                   (what an inverse form sees contains W_L w2)
                +-> W_rR -> z3 ... Delta_r ... w3
 
-    at the input:  xi+ = A xi + B W_L w2 + v - J u,    e = xi + W_rL w3
-    at the state:  xi+ = A xi + v - J u,               e = xi + W_L w2 + W_rL w3        z1 = W_p e
-                                                                                        y  = C e + n,   u = K y
+    at the input:  xi+ = A xi + B W_L w2 - J u,    e = xi + W_rL w3
+    at the state:  xi+ = A xi - J u,               e = xi + W_L w2 + W_rL w3        z1 = W_p e
+                                                                                    y  = C e + n,   u = K y
 
 *Why this is minimal.* With ``x = G s + ...`` the state of the perturbed plant and ``x_hat+ = A x_hat + B s + J u`` the
 observer, both are driven
@@ -37,10 +37,10 @@ _LEAST_NOISE, _PENALTY = 1e-3, 3e-2
 
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
-    """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); brackets for remainder and process noise."""
+    """Whole problem: w = (w1, w2, [w3], n), z = (z1, z2, [z3]); brackets for the remainder."""
     location, plant, eye = problem.form, problem.error_plant(), np.eye
     error, (n, _, n_u, n_z, q), m = plant.open_loop(), plant.sizes, problem.nominal.n_inputs
-    d, r, noise, v, u = np.split(eye(error.n_inputs), np.cumsum([m, n, q, n]), axis=1)
+    d, r, noise, u = np.split(eye(error.n_inputs), np.cumsum([m, n, q]), axis=1)
     z, y = np.split(eye(error.n_outputs), [n_z])
     blocks = {"error": error, "W_u": problem.input_weight, "W_L": problem.W_L, "W_R": problem.W_R}
     inputs, acts = {"w1": m, "w2": problem.W_L.n_inputs}, {"W_L": eye(problem.W_L.n_outputs)}
@@ -59,8 +59,6 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
         outputs["z3"] = {"W_rR": eye(problem.remainder_right.n_outputs)}
         wires["error"]["W_rL"] = r
     inputs["n"] = q
-    if problem.scaled_process_noise.any():
-        inputs["v"], wires["error"]["v"] = n, v
     system = interconnect(blocks, wires, inputs | {"u": n_u}, outputs | {"y": {"error": y}})
     return split(system, sum(inputs.values()), system.n_outputs - q, n_w1=m, n_z1=n_z)
 
@@ -75,10 +73,10 @@ def disturbed(problem: ObserverProblem, d: StateSpace, remainder: StateSpace | N
 
 
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
-    """White noise (nu_d, nu_r, n, v) through shaping filters at the input and at the state."""
+    """White noise (nu_d, nu_r, n) through shaping filters at the input and at the state."""
     plant = problem.error_plant()
     _, _, n_u, n_z, n_y = plant.sizes
-    rest = gain(np.eye(n_y + problem.nominal.n_states + n_u), plant.dt)  # n, v, u
+    rest = gain(np.eye(n_y + n_u), plant.dt)  # n, u
     return split(plant.open_loop() @ block_diagonal([d, r, rest]), d.n_inputs + r.n_inputs + rest.n_inputs - n_u, n_z)
 
 
@@ -88,7 +86,7 @@ def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
     Matrix inequalities do not resolve an encoder's noise of 1e-7 of the range, which has a floor here, nor a problem
     without a penalty. A result is certified for the true noise.
     """
-    whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None, process_noise=None))
+    whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None))
     whole = penalise(whole, _PENALTY)
     noise = np.maximum(1.0, _LEAST_NOISE * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
     w1, w2, n = np.split(np.arange(whole.sizes[1]), np.cumsum([len(problem.input_scale), problem.W_L.n_inputs]))

@@ -28,7 +28,7 @@ import numpy as np
 
 from ...core import AnyArray, StateSpace, frozen
 from ...core.frequency import nyquist_hz
-from ...core.norms import to_continuous
+from ...core.norms import sharpened, to_continuous
 from ..forms import Form, change_of, loop_of, residual_of
 from ..settings import PROOF
 
@@ -60,7 +60,7 @@ class Certificate:
 
 def certify(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray, pencils: list[Descriptor], dt: float) -> Certificate:
     """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, by level sets if possible."""
-    freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))
+    freq, peak = sharpened(ratio, freqs_hz, known.max(axis=0))
     if not pencils or peak <= 0 or not _trusted(pencils, freqs_hz, known, dt):
         return Certificate(ProofMethod.GRID, peak, freq)
     for _ in range(PROOF.levels):
@@ -71,16 +71,6 @@ def certify(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray, pencils: list[Des
             return Certificate(ProofMethod.LEVEL_SETS, peak, freq)
         peak, freq = float(values[top]), float(points[top])
     return Certificate(ProofMethod.GRID, peak, freq)
-
-
-def _sharpened(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray) -> tuple[float, float]:
-    """Return frequency and height of the highest peak, searched for between its neighbours."""
-    from scipy.optimize import minimize_scalar
-
-    top = int(known.argmax())
-    ends = freqs_hz[max(top - 1, 0)], freqs_hz[min(top + 1, len(freqs_hz) - 1)]
-    best = minimize_scalar(lambda f: -ratio(np.array([f])).max(), bounds=ends, method="bounded")
-    return max((float(freqs_hz[top]), float(known[top])), (float(best.x), -float(best.fun)), key=lambda peak: peak[1])
 
 
 def _crossings_hz(pencil: Descriptor, gamma: float, dt: float) -> AnyArray:

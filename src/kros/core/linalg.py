@@ -10,6 +10,12 @@ import numpy as np
 from .arrays import AnyArray, Array, ArrayLike
 
 
+def pieces(count: int, most: int) -> list[slice]:
+    """Return slices of a count, of at most so many and at least one, one after the other."""
+    step = max(1, most)
+    return [slice(start, start + step) for start in range(0, count, step)]
+
+
 def adjoint(matrices: AnyArray) -> AnyArray:
     """Return the Hermitian transposes of matrices, shape (..., n, m)."""
     return np.conj(np.swapaxes(matrices, -1, -2))
@@ -18,7 +24,7 @@ def adjoint(matrices: AnyArray) -> AnyArray:
 def radius_text(value: float) -> str:
     """Return a spectral radius as text, with enough digits to differ from one, for example ``1 - 2.5e-08``."""
     distance = 1 - value
-    if distance == 0 or not 0 < abs(distance) < 1e-4:
+    if not 0 < abs(distance) < 1e-4:
         return f"{value:.6g}"
     return f"1 {'-' if distance > 0 else '+'} {abs(distance):.2g}"
 

@@ -26,7 +26,7 @@ from ..core import (
     frozen,
     save_artifact,
 )
-from ..core.linalg import sigma_max, squared
+from ..core.linalg import pieces, sigma_max, squared
 from ..identify.edmd import ModelSamples
 from .forms import Form, evenly, residual
 from .settings import OUTLIER
@@ -67,9 +67,9 @@ def noise_share(
             problem = f"unit {unit} has a model or a draw that is not finite"
             raise DataError(f"Noise share: {problem}; leave the unit out, or raise alpha.")
     G = models.estimate.responses(freqs_hz, sample_period_s) / scale  # (unit, frequency, n, m)
-    noise, step = np.zeros(len(freqs_hz)), max(1, OUTLIER.at_once // (draws * n * max(n, m)))
+    noise, blocks = np.zeros(len(freqs_hz)), pieces(len(freqs_hz), OUTLIER.at_once // (draws * n * max(n, m)))
     for row in range(units):
-        for part in (slice(start, start + step) for start in range(0, len(freqs_hz), step)):
+        for part in blocks:
             drawn = models.responses(row, freqs_hz[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += _mean_square(residual(form, drawn, np.roll(drawn, 1, axis=0))) / units
     between = np.mean([_mean_square(residual(form, G[k], G)) for k in evenly(units, OUTLIER.nominals)], axis=0)

@@ -26,7 +26,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...core import ITERATED, AnyArray, Array, frozen
-from ...core.linalg import adjoint, entries_first, multiply, sigma_max_first
+from ...core.linalg import adjoint, entries_first, multiply, pieces, sigma_max_first
 
 TIE = ITERATED  # relative; scores closer than rounding are one
 _AT_ONCE = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
@@ -38,25 +38,22 @@ def smallest_largest(shape: tuple[int, int], size: Callable[[AnyArray, AnyArray]
     ``size(candidates, units)`` returns residuals, (row, frequency), for rows that broadcast to that: of a candidate and
     all units, (1, 1) and (row, 1), and of candidates and the witness of every frequency, (row, 1) and (1, frequency).
     """
-    lower, exact, row, step = np.zeros(shape), np.full(shape[0], np.inf), 0, max(1, _AT_ONCE // shape[1])
+    lower, exact, row, most = np.zeros(shape), np.full(shape[0], np.inf), 0, _AT_ONCE // shape[1]
+    every = np.arange(shape[0])[:, None]
     while lower[row].max() <= exact.min() * (1 + TIE):
-        at = np.array([[row]])
-        residuals = np.concatenate([size(at, part) for part in _pieces(np.arange(shape[0]), step)])
+        residuals = np.concatenate([size(every[[row]], every[part]) for part in pieces(shape[0], most)])
         lower[row] = residuals.max(axis=0)
         exact[row] = lower[row].max()
         rows = np.flatnonzero(np.isinf(exact) & (lower.max(axis=1) <= exact.min() * (1 + TIE)))
         if not rows.size:
             break
         witness = residuals.argmax(axis=0)[None]
-        lower[rows] = np.maximum(lower[rows], np.concatenate([size(part, witness) for part in _pieces(rows, step)]))
+        of_witness = np.concatenate([size(every[rows[part]], witness) for part in pieces(len(rows), most)])
+        lower[rows] = np.maximum(lower[rows], of_witness)
         row = int(rows[np.argmin(lower[rows].max(axis=1))])
     least = exact.min()
     index = int(np.argmax(exact <= least + TIE * np.abs(least)))  # the first of those that rounding may have told apart
     return index, lower[index]
-
-
-def _pieces(rows: AnyArray, step: int) -> list[AnyArray]:
-    return np.split(rows[:, None], range(step, len(rows), step))
 
 
 def unit_circle(points: int) -> AnyArray:

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import EPS, TINY, Array, Flags, IdentificationError
-from ...core.linalg import qr_triangle, radius_text
+from ...core.linalg import pieces, qr_triangle, radius_text
 from ...data import EpisodeBatch, EpisodeKey, Population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
@@ -237,7 +237,7 @@ def free_run_errors(
     """
     lifting, parameters = data.lifting, {name: given[rows] for name, given in data.parameters.items()}
     errors = []
-    for part in (slice(start, start + _TOGETHER) for start in range(0, len(keys), _TOGETHER)):
+    for part in pieces(len(keys), _TOGETHER):
         batch = EpisodeBatch.read(data.population, keys[part])
         values = {name: given[part] for name, given in parameters.items()}
         x, u = (np.ascontiguousarray(np.swapaxes(signal, 0, 1)) for signal in (batch.states, batch.inputs))

@@ -142,9 +142,9 @@ def fit_magnitude(
 
 @frozen
 class Bound:
-    """Best bound of one order."""
+    """Magnitudes above data, and their largest excess."""
 
-    sections: Sections  # above the data
+    sections: Sections
     excess_db: float
 
 

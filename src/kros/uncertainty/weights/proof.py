@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -61,9 +61,8 @@ class Certificate:
 def certify(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray, pencils: list[Descriptor], dt: float) -> Certificate:
     """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, by level sets if possible."""
     freq, peak = sharpened(ratio, freqs_hz, known.max(axis=0))
-    if not pencils or peak <= 0 or not _trusted(pencils, freqs_hz, known, dt):
-        return Certificate(ProofMethod.GRID, peak, freq)
-    for _ in range(PROOF.levels):
+    provable = pencils and peak > 0 and _trusted(pencils, freqs_hz, known, dt)
+    for _ in range(PROOF.levels if provable else 0):
         points = np.unique(np.concatenate([_candidates(p, peak * (1 + PROOF.margin), dt) for p in pencils]))
         values = ratio(points).max(axis=0)
         top = int(values.argmax())
@@ -116,12 +115,6 @@ class Descriptor:
         """Return a discrete system."""
         mapped = to_continuous(system)
         return cls(np.eye(mapped.n_states), mapped.A, mapped.B, mapped.C, mapped.D)
-
-    @classmethod
-    def identity(cls, size: int) -> Descriptor:
-        """Return ones."""
-        none = np.zeros((0, 0))
-        return cls(none, none, np.zeros((0, size)), np.zeros((size, 0)), np.eye(size))
 
     def __matmul__(self, first: Descriptor) -> Descriptor:
         """Return the series connection, the other one first."""
@@ -216,7 +209,7 @@ def residual_system(form: Form, G: Descriptor, Gp: Descriptor, remainder: bool) 
     if not form.inverse:
         return (Gp - G) - change_of(form, G, E)
     loop = loop_of(form, G, E)
-    inverse = (Descriptor.identity(len(loop.D)) - loop).inverse()
+    inverse = replace(loop, C=-loop.C, D=np.eye(len(loop.D)) - loop.D).inverse()
     return Gp - (G @ inverse if form.at_input else inverse @ G)
 
 

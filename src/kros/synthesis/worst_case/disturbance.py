@@ -30,8 +30,11 @@ def average_disturbance(problem: ObserverProblem, max_order: int, tolerance_db: 
         shaped = of(np.sum(left, axis=-1) * power)
     else:
         shaped = problem.W_L @ of(power)
-    rest = _remainder(problem, freqs)
-    return disturbed(problem, shaped, None if rest is None else of(rest))
+    if problem.remainder is None:
+        return disturbed(problem, shaped, None)
+    left, right = (np.abs(side.frequency_response(freqs)) ** 2 for side in problem.remainder)
+    energy = right.sum(axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
+    return disturbed(problem, shaped, of(left.sum(axis=-1) * energy[:, None]))
 
 
 def design_grid(problem: ObserverProblem) -> AnyArray:
@@ -40,15 +43,6 @@ def design_grid(problem: ObserverProblem) -> AnyArray:
     systems = [problem.nominal, problem.W_L, problem.W_R, problem.input_weight]
     slowest = np.abs(np.concatenate([s.poles() for s in systems]) - 1).min(initial=1.0)
     return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, 400) / (2 * np.pi * dt)  # 400 points
-
-
-def _remainder(problem: ObserverProblem, freqs_hz: AnyArray) -> AnyArray | None:
-    """Average spectrum of the remainder, shape (f, n)."""
-    if problem.remainder is None:
-        return None
-    left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
-    energy = np.sum(np.abs(right) ** 2, axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
-    return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
 
 def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, max_order: int, tolerance_db: float) -> StateSpace:

@@ -285,5 +285,4 @@ def precise_gain(system: StateSpace, freq_hz: float) -> float:
         point = mpmath.exp(s * mpmath.mpf(system.dt)) if system.dt > 0 else s
         A, B, C, D = (mpmath.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C, system.D))
         response = C * mpmath.inverse(point * mpmath.eye(system.n_states) - A) * B + D
-        values = np.array([[complex(response[i, j]) for j in range(response.cols)] for i in range(response.rows)])
-    return float(np.linalg.norm(values, 2))
+        return float(np.linalg.norm(np.array(response.tolist(), complex), 2))

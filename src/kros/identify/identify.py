@@ -181,6 +181,11 @@ class _Reduced:
         """Units that speak for the population."""
         return np.isin(self.units, list(self.base.facts.pooled))
 
+    @property
+    def rows(self) -> Flags | slice:
+        """Rows of these units; of all where there are none."""
+        return self.pooled if self.pooled.any() else slice(None)
+
     def lifted(self, lifting: Lifting) -> Factor:
         """Return factors for a kind of model."""
         return lifted_factor(self.factor, self.base.lifting, self.parameters, lifting)
@@ -204,8 +209,8 @@ class _Reduced:
 
     def _unfitted(self, kind: str, lifting: Lifting) -> ModelSet:
         population = self.base.population
-        rows = self.pooled if self.pooled.any() else slice(None)
-        ranges, nothing = Ranges.of(self.lifted(lifting), lifting.n_lifted, rows), np.zeros((len(self.units), 0, 0))
+        ranges = Ranges.of(self.lifted(lifting), lifting.n_lifted, self.rows)
+        nothing = np.zeros((len(self.units), 0, 0))
         return ModelSet(
             name=kind,
             condition=self.condition,
@@ -222,9 +227,8 @@ class _Reduced:
 
     def _search(self, sets: list[ModelSet], factors: list[Factor], settings: IdentifySettings) -> float:
         """Return the common regularisation of channels divided by their ranges."""
-        rows = self.pooled if self.pooled.any() else slice(None)
-        triangles = [m.ranges.triangles(factor.R[rows]) for m, factor in zip(sets, factors, strict=True)]
-        shared = [(R, m.lifting.n_lifted) for R, m in zip(triangles, sets, strict=True)]
+        pairs = zip(sets, factors, strict=True)
+        shared = [(m.ranges.triangles(factor.R[self.rows]), m.lifting.n_lifted) for m, factor in pairs]
         edge = smallest_stabilising_alpha(shared)
         search, limit = AlphaSearch(), RefineOptions().largest_residual
         times = search.factor

@@ -73,7 +73,7 @@ class Basis:
         shift = np.eye(self.delays, k=-1)
         poles = np.array(self.poles)
         b = np.concatenate([np.eye(self.delays, 1)[:, 0], np.sqrt(1 - poles**2)])
-        return block_diag(shift, np.diag(poles))[-self.size :, -self.size :], b
+        return block_diag(shift, np.diag(poles)), b
 
     @property
     def size(self) -> int:
@@ -106,14 +106,13 @@ def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
     largest = float(np.max(np.diag(R), initial=0.0))
     if not (np.isfinite(R).all() and largest > 0):
         raise SynthesisError("Shaping filter: the residual is zero or not finite; correct nothing (open loop).")
-    R = R + _FLOOR * largest * np.eye(n)
+    floor = _FLOOR * largest * np.eye(n)
+    R, spectrum = R + floor, spectrum + floor
     response = basis.response(np.exp(1j * np.linspace(0, np.pi, f)))
     k = basis.size
     blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
-    floor = np.einsum("f,fa,fb->ab", weight, response, response.conj()).real
-    G = blocks.reshape(k * n, k * n) + _FLOOR * largest * np.kron(floor, np.eye(n))
+    G = blocks.reshape(k * n, k * n)
     cross = np.einsum("f,fb,fij->ibj", weight, response.conj(), spectrum, optimize=True).real.reshape(n, k * n)
-    cross = cross + _FLOOR * largest * np.kron(weight @ response.conj().real, np.eye(n))
     Theta = np.linalg.solve(G, cross.T).T if k else cross
     innovation = R - Theta @ cross.T
     values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)

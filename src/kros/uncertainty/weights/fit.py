@@ -57,7 +57,8 @@ def checking_grid(freqs_hz: AnyArray, sample_period_s: float) -> AnyArray:
     between = (inside[:-1, None] * (inside[1:] / inside[:-1])[:, None] ** steps).ravel()
     dense = np.unique(np.concatenate([[0.0], between, freqs_hz, [nyquist_hz(sample_period_s)]]))
     tau = bilinear_squared(dense, sample_period_s)
-    inner = np.log10(tau[(tau > 0) & (tau < np.inf)]) if ((tau > 0) & (tau < np.inf)).any() else np.zeros(1)
+    inside = tau[(tau > 0) & (tau < np.inf)]
+    inner = np.log10(inside) if inside.size else np.zeros(1)
     low, high = inner.min() - PROOF.decades, inner.max() + PROOF.decades
     logs = np.logspace(low, high, 1 + int(PROOF.a_decade * (high - low)))
     return joined(dense, np.arctan(np.sqrt(logs)) / (np.pi * sample_period_s))

@@ -29,6 +29,11 @@ def radius_text(value: float) -> str:
     return f"1 {'-' if distance > 0 else '+'} {abs(distance):.2g}"
 
 
+def spectral_radius(matrices: AnyArray) -> AnyArray:
+    """Return the largest eigenvalue magnitude of matrices (..., n, n), shape (...); zero of empty ones."""
+    return np.abs(np.linalg.eigvals(matrices)).max(axis=-1, initial=0.0)
+
+
 def qr_triangle(matrix: Array) -> Array:
     """Return the triangular factor R of a QR decomposition, batched; shape (..., min(rows, n), n)."""
     return np.asarray(np.linalg.qr(matrix, mode="r"))

@@ -41,7 +41,7 @@ def as_state_space(system: Any) -> StateSpace:
     if system.batch_shape:
         problem = f"needs one system, found a batch of shape {system.batch_shape}"
         raise DimensionError(f"System norm: {problem}; index it, for example system[0].")
-    if not all(np.isfinite(getattr(system, name)).all() for name in "ABCD"):
+    if not system.is_finite():
         raise KrosError("System norm: the matrices contain NaN or infinity; look at the step that built them.")
     return system
 

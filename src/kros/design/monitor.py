@@ -17,6 +17,7 @@ from itertools import combinations, product
 import numpy as np
 
 from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen
+from ..core.linalg import spectral_radius
 from ..observer import Observer, run_innovations, spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
@@ -153,6 +154,6 @@ def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
     """Return the samples in which a start is forgotten, by the slowest mode of the observer's linear part."""
     n, r, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted
     step = observer.one_step[:, [*range(n), *range(nl, nl + r)]]
-    radius = float(np.abs(np.linalg.eigvals(step)).max(initial=0.0))
+    radius = float(spectral_radius(step))
     samples = settings.settle[1] if radius >= 1 else np.log(settings.forgotten) / np.log(max(radius, ITERATED))
     return int(np.clip(np.ceil(samples), *settings.settle)) + observer.runtime.delay

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core import EPS, TINY, AnyArray, Array, ArrayLike, DataError, IdentificationError, StateSpace, frozen
-from ..core.linalg import qr_triangle
+from ..core.linalg import qr_triangle, spectral_radius
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class KoopmanMatrices:
 
     def spectral_radius(self) -> Array:
         """Return the largest eigenvalue magnitude of each A."""
-        return np.abs(np.linalg.eigvals(self.A)).max(axis=-1)
+        return spectral_radius(self.A)
 
     def responses(self, freqs_hz: Array, sample_period_s: float) -> AnyArray:
         """Return frequency responses from inputs to lifted states, shape (..., frequency, n, m)."""

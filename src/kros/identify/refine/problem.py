@@ -26,6 +26,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import TINY, Array, Flags, Whole, frozen
+from ...core.linalg import spectral_radius
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
 from ..factors import Factor
@@ -125,7 +126,7 @@ class RefinementProblem:
         """Return which models are finite and stable as linear systems."""
         A = (V @ self.T.T)[..., : self.lifting.n_lifted]
         finite = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
-        radius = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], A, 0.0))).max(axis=-1)
+        radius = spectral_radius(np.where(finite[..., None, None], A, 0.0))
         return np.asarray(finite & (radius < 1 - self.options.margin))
 
     def matrices(self, V: Array) -> KoopmanMatrices:

@@ -35,7 +35,6 @@ from numpy.linalg import cholesky, inv, solve, svd
 from ...core import EPS, TINY, AnyArray, StateSpace, frozen
 from ...core.norms import gramian, h2_norm
 from ..generalized_plant import GeneralizedPlant
-from ..problem.observer_problem import multiplied
 from ..riccati.h2 import balancing, h2
 from .barrier import Block
 
@@ -183,7 +182,7 @@ class MixedInequalities:
         B = solve(V, Bn - Y @ p.B2 @ Dn)
         middle = v["An"] + eye - V @ B @ p.C2 @ X - Y @ p.B2 @ C @ U - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
         A = solve(V, solve(U.T, middle.T).T)
-        return multiplied(StateSpace(A, B, C, Dn, p.dt), self.controls, 1 / self.measurements)
+        return StateSpace(A, B, C, Dn, p.dt).multiplied(self.controls, 1 / self.measurements)
 
 
 def _blocks(rows: list[list[AnyArray]]) -> AnyArray:

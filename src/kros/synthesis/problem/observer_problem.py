@@ -40,7 +40,6 @@ A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -301,7 +300,7 @@ class ObserverProblem:
     def scaled_estimate(self, estimate: StateSpace) -> StateSpace:
         """Turn an estimate of all states from measurements, states and inputs into scaled coordinates."""
         sizes = np.concatenate([self.noise, self.output_scale, self.input_scale])
-        return multiplied(estimate, 1 / self.output_scale, sizes)
+        return estimate.multiplied(1 / self.output_scale, sizes)
 
     @property
     def _scales(self) -> tuple[AnyArray, AnyArray]:
@@ -311,14 +310,9 @@ class ObserverProblem:
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
         correction, noise = self._scales
-        return multiplied(controller, 1 / correction, noise)
+        return controller.multiplied(1 / correction, noise)
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
         correction, noise = self._scales
-        return multiplied(controller, correction, 1 / noise)
-
-
-def multiplied(system: StateSpace, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
-    """Return a system with outputs and inputs multiplied."""
-    return replace(system, B=system.B * inputs, C=outputs[:, None] * system.C, D=outputs[:, None] * system.D * inputs)
+        return controller.multiplied(correction, 1 / noise)

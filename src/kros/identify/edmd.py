@@ -195,7 +195,6 @@ def _stable_without(factors: list[tuple[Array, int]], margin: float) -> bool:
 class ModelSamples:
     """Models of resampled episodes around an estimate."""
 
-    unit_ids: tuple[str, ...]
     estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
     samples: KoopmanMatrices  # A (unit, draw, n, n) and B (unit, draw, n, m)
 
@@ -219,9 +218,7 @@ def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     return weights
 
 
-def bootstrap_edmd(
-    R: Array, n_lifted: int, alpha: float, weights: Array, unit_ids: Sequence[str] | None = None
-) -> ModelSamples:
+def bootstrap_edmd(R: Array, n_lifted: int, alpha: float, weights: Array) -> ModelSamples:
     """Return EDMD models of resampled episodes at a fixed alpha, from factors (unit, episode, k, k) and weights."""
     units, episodes, width, _ = R.shape
     models = []
@@ -229,5 +226,4 @@ def bootstrap_edmd(
         stacked = (np.sqrt(draw)[..., None, None] * R).reshape(units, episodes * width, width)
         models.append(edmd(qr_triangle(stacked), n_lifted, alpha))
     drawn = KoopmanMatrices(*(np.stack([getattr(m, name) for m in models[1:]], axis=1) for name in ("A", "B")))
-    ids = tuple(map(str, range(units) if unit_ids is None else unit_ids))
-    return ModelSamples(ids, models[0], drawn)
+    return ModelSamples(models[0], drawn)

@@ -22,7 +22,6 @@ import numpy as np
 
 from ..core import (
     AnyArray,
-    DataError,
     frozen,
     save_artifact,
 )
@@ -61,11 +60,6 @@ def noise_share(
 ) -> NoiseShare:
     """Compare the residuals between units with those between resampled models, of responses divided by `scale`."""
     (units, draws, _, n), m = models.samples.A.shape, models.samples.B.shape[-1]
-    parts = (models.estimate.A, models.estimate.B, models.samples.A, models.samples.B)
-    for unit, *matrices in zip(models.unit_ids, *parts, strict=True):
-        if not all(np.isfinite(M).all() for M in matrices):
-            problem = f"unit {unit} has a model or a draw that is not finite"
-            raise DataError(f"Noise share: {problem}; leave the unit out, or raise alpha.")
     G = models.estimate.responses(freqs_hz, sample_period_s) / scale  # (unit, frequency, n, m)
     noise, blocks = np.zeros(len(freqs_hz)), pieces(len(freqs_hz), OUTLIER.at_once // (draws * n * max(n, m)))
     for row in range(units):

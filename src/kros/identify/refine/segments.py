@@ -109,9 +109,6 @@ def read_segments(
         for episode in dict.fromkeys(owners.tolist()):
             key = episodes[episode]
             samples = population.read(key)
-            if len(samples) < history + 2:
-                problem = f"{key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}"
-                raise DataError(f"Refinement: {problem}; leave the episode out or use shorter delays.")
             for column in np.flatnonzero(owners == episode):
                 start = int(rng.integers(0, max(1, len(samples) - length + 1)))
                 piece = samples[start : start + length]

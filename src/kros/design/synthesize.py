@@ -109,11 +109,12 @@ def synthesize(
     compared = ObserverSettings.of(observer or {}, "Synthesize, observer")
     regression = EstimatorSettings.of(estimator or {}, "Synthesize, estimator")
     sensors = {name: Sensor.of(one, f"Synthesize, sensor.{name}") for name, one in (sensor or {}).items()}
+    work = work or Work()
     if method is None:
-        every = synthesize_all(uncertain, options, compared, regression, sensors, work=work)
+        every = synthesize_all(uncertain, options, compared, regression, sensors, work)
         return every.designs[every.deployed]
     kind, chosen = _named(uncertain, method, regression)
-    tasks, work = tasks_of(uncertain, kind, [chosen], sensors), work or Work()
+    tasks = tasks_of(uncertain, kind, [chosen], sensors)
     designs, failed = _designed(tasks, work)
     name = f"{kind}/{chosen.name}"
     if name in failed:
@@ -123,15 +124,13 @@ def synthesize(
 
 def synthesize_all(
     uncertain: UncertainModels,
-    settings: SynthesisSettings | None = None,
-    observer: ObserverSettings | None = None,
-    estimator: EstimatorSettings | None = None,
-    sensor: Sensors | None = None,
-    *,
-    work: Work | None = None,
+    settings: SynthesisSettings,
+    observer: ObserverSettings,
+    estimator: EstimatorSettings,
+    sensor: Sensors,
+    work: Work,
 ) -> Designs:
     """Design all observers that settings ask for, certify them, and choose the one that is deployed."""
-    settings, observer, work = settings or SynthesisSettings(), observer or ObserverSettings(), work or Work()
     methods = methods_of((*observer.baselines, *settings.methods), estimator)
     tasks = [task for kind in uncertain.models.kinds for task in tasks_of(uncertain, kind, methods, sensor)]
     designs, failed = _designed(tasks, work)

@@ -204,4 +204,5 @@ def residuals_beside_weights(models: ModelSet, uncertain: UncertainModel, points
     freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // points)]
     nominal = uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)
     units = dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True))
-    return unit_residuals(uncertain.form, nominal, units, uncertain.weight, freqs, models.sample_period_s)
+    cover = uncertain.weight.magnitudes(freqs)
+    return unit_residuals(uncertain.form, nominal, units, cover, freqs, models.sample_period_s)

@@ -85,7 +85,7 @@ class ResponsePrior:
         left = np.linalg.pinv(G)
         E = left @ (G - G0)
         Z = np.concatenate([G, np.broadcast_to(np.eye(m), (*G.shape[:2], m, m))], axis=-2)
-        return np.asarray(E), left @ Phi, self.T.T @ Z @ (np.eye(m) - E)
+        return E, left @ Phi, self.T.T @ Z @ (np.eye(m) - E)
 
     def normal(self, V: Array) -> Array:
         """Return ``[J r]^T [J r]`` with r = -E, weighted for the gradient of the cost; shape (unit, P + 1, P + 1)."""

@@ -66,7 +66,7 @@ class OneStep:
         out = np.empty((len(rows), p + 1, p + 1))
         out[:, :p, :p], out[:, :p, p], out[:, p, :p] = G, slope, slope
         out[:, p, p] = np.maximum(power - self.least[:, row], 0.0)
-        return np.asarray(out / self.variance[row])
+        return out / self.variance[row]
 
 
 @frozen
@@ -125,9 +125,9 @@ class RefinementProblem:
     def admissible(self, V: Array) -> Flags:
         """Return which models are finite and stable as linear systems."""
         A = (V @ self.T.T)[..., : self.lifting.n_lifted]
-        finite = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
+        finite = np.all(np.isfinite(A), axis=(-1, -2))
         radius = spectral_radius(np.where(finite[..., None, None], A, 0.0))
-        return np.asarray(finite & (radius < 1 - self.options.margin))
+        return finite & (radius < 1 - self.options.margin)
 
     def matrices(self, V: Array) -> KoopmanMatrices:
         """Return A and B of whitened parameters."""
@@ -136,7 +136,7 @@ class RefinementProblem:
 
     def finite(self, V: Array) -> Flags:
         """Return which models hold numbers only."""
-        return np.asarray(np.isfinite(V).all(axis=(-1, -2)))
+        return np.all(np.isfinite(V), axis=(-1, -2))
 
     def run(self, V: Array) -> Normal:
         """Return the normal equations of the free runs alone."""
@@ -187,4 +187,4 @@ def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
     slope = (turn[..., None, None] * left[..., :, None] * columns[..., None, :]).real.reshape(problems, n, n * p)
     J = np.where(excess[..., None] > 0, slope / guard, 0.0)
     rows = np.sqrt(weight) * np.concatenate([J, -excess[..., None]], axis=-1)
-    return np.asarray(np.swapaxes(rows, -1, -2) @ rows)
+    return np.swapaxes(rows, -1, -2) @ rows

@@ -187,10 +187,6 @@ class ResidualProblem:
         loop = self.loop(shaping, K)
         return np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, loop.dt) @ loop.C.T), TINY))
 
-    def norm(self, shaping: StateSpace, K: StateSpace) -> float:
-        """Root mean square of the scaled error."""
-        return h2_norm(self.loop(shaping, K))
-
     def unit_errors(self, K: StateSpace) -> Array:
         """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
         f, n = self.spectra.shape[1:3]
@@ -234,7 +230,7 @@ def residual_h2(
     full = problem.filter()
     most = full.n_states if max_order is None else max_order
     K = problem.reduced(full, problem.correction(full), tolerance_percent, most)
-    norm = problem.norm(full, K)
+    norm = h2_norm(problem.loop(full, K))
     note = f"mean of {len(problem.spectra)} units, {problem.basis.delays} delays, lags {problem.basis.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
     lower, gap, notes = enclosed(norm, problem.lower_bound(full))

@@ -100,10 +100,8 @@ class ResponsePrior:
         H = form.transpose(0, 1, 3, 2, 4).reshape(units, rows * columns, -1)
         pull = adjoint(a) @ (E * slope[..., None, None]) @ adjoint(Z)
         g = -pull.real.sum(axis=1).reshape(units, -1)
-        out = np.empty((units, H.shape[-1] + 1, H.shape[-1] + 1))
-        out[:, :-1, :-1], out[:, :-1, -1], out[:, -1, :-1] = H, g, g
-        out[:, -1, -1] = self.weight * self.level**2 * np.mean(((1 + size) ** self.power - 1) / self.power, axis=1)
-        return out
+        cost = self.weight * self.level**2 * np.mean(((1 + size) ** self.power - 1) / self.power, axis=1)
+        return np.block([[H, g[..., None]], [g[:, None], cost[:, None, None]]])
 
 
 def peak_residual(A: Array, B: Array, points: int = 200) -> float:

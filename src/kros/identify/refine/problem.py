@@ -63,10 +63,8 @@ class OneStep:
         G, c = self.matrix[:, :p, :p], self.matrix[:, :p, p + row]
         slope = c - (G @ rows[..., None])[..., 0]
         power = self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1)
-        out = np.empty((len(rows), p + 1, p + 1))
-        out[:, :p, :p], out[:, :p, p], out[:, p, :p] = G, slope, slope
-        out[:, p, p] = np.maximum(power - self.least[:, row], 0.0)
-        return out / self.variance[row]
+        cost = np.maximum(power - self.least[:, row], 0.0)
+        return np.block([[G, slope[..., None]], [slope[:, None], cost[:, None, None]]]) / self.variance[row]
 
 
 @frozen
@@ -150,10 +148,10 @@ class RefinementProblem:
         normal = self.run(V)
         each = np.broadcast_to(V, (len(normal.matrix), nl, p))
         total = np.zeros((len(each), nl * p + 1, nl * p + 1))
-        _add(total, normal.matrix, slice(0, n * p))
+        _add(total, normal.matrix, np.arange(n * p))
         weight = self.options.row_weight * normal.counts[:, None, None]
         for row in range(n, nl):
-            _add(total, weight * self.one_step.normal(each[:, row], row - n), slice(row * p, (row + 1) * p))
+            _add(total, weight * self.one_step.normal(each[:, row], row - n), row * p + np.arange(p))
         total = total.sum(axis=0, keepdims=True) if self.pooled else total
         if self.edged:
             total += stability_barrier(V, self.T, self.options.guard, self.edge_weight)
@@ -168,11 +166,10 @@ def _unexplained(M: Array, p: int) -> Array:
     return np.diagonal(M[p:, p:]) - np.sum(rows * M[:p, p:].T, axis=1)
 
 
-def _add(total: Array, part: Array, place: slice) -> None:
-    total[:, place, place] += part[:, :-1, :-1]
-    total[:, place, -1] += part[:, :-1, -1]
-    total[:, -1, place] += part[:, -1, :-1]
-    total[:, -1, -1] += part[:, -1, -1]
+def _add(total: Array, part: Array, place: Whole) -> None:
+    """Add normal equations of some parameters."""
+    at = np.append(place, -1)
+    total[:, at[:, None], at] += part
 
 
 def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:

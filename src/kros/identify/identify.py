@@ -232,10 +232,10 @@ class _Reduced:
         edge = smallest_stabilising_alpha(shared)
         search, limit = AlphaSearch(), RefineOptions().largest_residual
         times = search.factor
-        for doubled in range(search.doublings if self.feeds_synthesis and edge > 0 else 0):  # until models are alike
-            models = [edmd(R, n, search.factor * 2.0**doubled * edge) for R, n in shared]
-            if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):
-                times = search.factor * 2.0**doubled
+        for factor in times * 2.0 ** np.arange(search.doublings if self.feeds_synthesis and edge > 0 else 0):
+            models = [edmd(R, n, factor * edge) for R, n in shared]
+            if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):  # they are alike
+                times = float(factor)
                 break
         note = (
             "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"

@@ -7,7 +7,7 @@ component of w2.
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -53,15 +53,5 @@ def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, max_order: int, tole
             systems.append(gain([[0.0]], dt))
             continue
         magnitude = np.sqrt(np.maximum(column, _FLOOR * column.max()))
-        shape = (magnitude / magnitude.max()).tobytes()
-        system = _fitted(freqs_hz.tobytes(), shape, dt, max_order, tolerance_db)
-        ratio = magnitude / np.abs(system.frequency_response(freqs_hz)[:, 0, 0])
-        systems.append(gain([[float(ratio.max())]], dt) @ system)
+        systems.append(fit_magnitude(freqs_hz, magnitude, dt, max_order=max_order, tolerance_db=tolerance_db).system)
     return block_diagonal(systems)
-
-
-@lru_cache(maxsize=100)
-def _fitted(freqs_hz: bytes, magnitude: bytes, dt: float, max_order: int, tolerance_db: float) -> StateSpace:
-    """Return the system of a fit; problems that differ in noise alone share it."""
-    values = np.frombuffer(freqs_hz), np.frombuffer(magnitude)
-    return fit_magnitude(*values, dt, max_order=max_order, tolerance_db=tolerance_db).system

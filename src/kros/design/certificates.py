@@ -155,8 +155,8 @@ def certify_model(
     """Certify one observer everywhere, or where slopes have no global bound in an operating box around recordings."""
     certificate, models = relift_certificate(observer, scales=scales), task.models
     if certificate.status is ReliftStatus.UNBOUNDED:
-        signals = [np.concatenate([b.states, b.inputs], axis=-1)[b.inside] for b in batches]
-        low, high = (end([end(part, axis=0) for part in signals], axis=0) for end in (np.min, np.max))
+        signals = np.concatenate([np.concatenate([b.states, b.inputs], axis=-1)[b.inside] for b in batches])
+        low, high = signals.min(axis=0), signals.max(axis=0)
         middle, half = (low + high) / 2, DEFAULT.box * (high - low) / 2
         ends = zip((middle - half).tolist(), (middle + half).tolist(), strict=True)
         box = dict(zip((*observer.recorded, *models.recorded_inputs), ends, strict=True))

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from ...core import AnyArray, StateSpace, block_diagonal, gain
+from ...core import AnyArray, StateSpace, block_diagonal
 from ...uncertainty import fit_magnitude
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import disturbed
@@ -47,11 +47,10 @@ def design_grid(problem: ObserverProblem) -> AnyArray:
 
 def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, max_order: int, tolerance_db: float) -> StateSpace:
     """Return one filter a channel, whose magnitude touches the root of its power, shape (f, channels), from above."""
-    systems = []
-    for column in power.T:
-        if column.max() <= _NOTHING:
-            systems.append(gain([[0.0]], dt))
-            continue
-        magnitude = np.sqrt(np.maximum(column, _FLOOR * column.max()))
-        systems.append(fit_magnitude(freqs_hz, magnitude, dt, max_order=max_order, tolerance_db=tolerance_db).system)
-    return block_diagonal(systems)
+    largest = power.max(axis=0)
+    power = np.where(largest > _NOTHING, np.maximum(power, _FLOOR * largest), 0.0)
+    fits = [
+        fit_magnitude(freqs_hz, column, dt, max_order=max_order, tolerance_db=tolerance_db)
+        for column in np.sqrt(power).T
+    ]
+    return block_diagonal([fit.system for fit in fits])

@@ -128,7 +128,6 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
         models = problem.matrices(V[pooled])
         rms, _ = free_run_errors(data, models, pooled.tolist(), held)
         rows.append((float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)))
-        log.debug("prior of strength %g: score %.4g, peak residual %.3g", strength, *rows[-1])
         earlier = rows[-1 - options.patience][0] if len(rows) > options.patience else np.inf
         if rows[-1][0] > (1 - options.tolerance / 2) * earlier or rows[-1][1] > options.largest_residual:
             break

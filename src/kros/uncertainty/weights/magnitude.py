@@ -28,7 +28,6 @@ W. Dinkelbach, "On nonlinear fractional programming", Management Science 13 (196
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -52,8 +51,6 @@ from ...core import (
 from ...core.frequency import bilinear_squared, check_grid
 from ..settings import MAGNITUDE, WEIGHT
 from .sections import Sections
-
-_LOG = logging.getLogger(__name__)
 
 
 @frozen
@@ -161,8 +158,8 @@ def rising_bounds(tau: AnyArray, magnitude: AnyArray, max_order: int) -> Iterato
             try:
                 sections = best.factor().lifted(slice(0, 1), float(np.log(unit)))
                 bound = Bound(sections, 10 * float(np.log10(ratio)))
-            except KrosError as error:
-                _LOG.debug("Magnitude fit: %s", error)
+            except KrosError:  # roots that do not settle, or too near the unit circle
+                pass
         if bound is not None:
             yield bound
         if ratio < MAGNITUDE.exact:
@@ -185,8 +182,7 @@ def _best(tau: AnyArray, targets: AnyArray, order: int, gamma: float) -> Rationa
         best = _Grid.of(tau, targets, knots, cuts).best(gamma)
         try:
             zeros = best.not_positive() if best is not None else []
-        except KrosError as error:  # multiple roots
-            _LOG.debug("Magnitude fit: %s", error)
+        except KrosError:  # multiple roots
             return None
         if not zeros:
             return best

@@ -8,7 +8,21 @@ Examples
 1.0
 """
 
-from .arrays import AnyArray, Array, ArrayLike, Bits, ByName, Columns, Flags, Names, Parameters, Record, Whole, frozen
+from .arrays import (
+    AnyArray,
+    Array,
+    ArrayLike,
+    Bits,
+    ByName,
+    Columns,
+    Flags,
+    Names,
+    Parameters,
+    Record,
+    Whole,
+    frozen,
+    grouped,
+)
 from .artifacts import Storable, digest_of, load_artifact, loader, plain, read_json, save_artifact, united, write_json
 from .errors import (
     ConfigError,

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, SynthesisError, frozen
+from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, SynthesisError, frozen, grouped
 from ..data import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
@@ -61,9 +61,8 @@ class Baseline:
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Mapping[str, Array]) -> Array:
         """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
-        units = dict[str, list[int]]()
-        for i, key in enumerate(keys):
-            units.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
+        names = [key.unit if key.unit in self.by_unit else "" for key in keys]
+        units = grouped(range(len(keys)), names.__getitem__)
         samples, parts = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), list[Array]()
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core import TINY, Array, Record, StateSpace, SynthesisError, frozen, gain
-from ..data import EpisodeBatch, EpisodeKey
+from ..core import TINY, Array, Record, StateSpace, SynthesisError, frozen, gain, grouped
+from ..data import EpisodeBatch
 from ..evaluate.errors import error_rms
 from ..identify import ModelSet
 from ..loops import recursion
@@ -79,9 +79,8 @@ def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
 def certified_on(task: DesignTask) -> list[EpisodeBatch]:
     """Return the starts of the first episodes of units, all of short ones, and the same of other conditions."""
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
-    others = dict[str, list[EpisodeKey]]()
-    for key in (k for k in task.recordings.keys if k.condition not in home and k.unit in units):
-        others.setdefault(key.condition, []).append(key)
+    elsewhere = (k for k in task.recordings.keys if k.condition not in home and k.unit in units)
+    others = grouped(elsewhere, lambda key: key.condition)
     batches = []
     for training in (task.training, *(replace(task.recordings, keys=tuple(keys)) for keys in others.values())):
         firsts = {key.unit: key for key in reversed(training.keys)}

@@ -16,7 +16,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen
+from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen, grouped
 from ..core.linalg import spectral_radius
 from ..observer import Observer, run_innovations, spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
@@ -83,12 +83,12 @@ def fit_monitor(
 
 def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[Group, TrainingSet]]:
     """Take some episodes of some units, by unit and condition."""
-    groups = list(dict.fromkeys((key.unit, key.condition) for key in training.keys))
-    units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), settings.units))
-    for unit, condition in (group for group in groups if group[0] in units):
-        keys = [key for key in training.keys if (key.unit, key.condition) == (unit, condition)]
-        population = training.population.select([unit], [condition])
-        yield (unit, condition), replace(training, keys=tuple(spread(keys, settings.episodes)), population=population)
+    groups = grouped(training.keys, lambda key: (key.unit, key.condition))
+    units = spread(list(dict.fromkeys(unit for unit, _ in groups)), settings.units)
+    for (unit, condition), keys in groups.items():
+        if unit in units:
+            some, population = tuple(spread(keys, settings.episodes)), training.population.select([unit], [condition])
+            yield (unit, condition), replace(training, keys=some, population=population)
 
 
 def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judged]:

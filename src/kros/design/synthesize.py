@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, ConfigError, Record, SynthesisError, Work, frozen, plain, require_kind
+from ..core import Array, ByName, ConfigError, Record, SynthesisError, Work, frozen, grouped, plain, require_kind
 from ..data import scaling_of
 from ..identify import IdentifiedModels, ModelSet
-from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor, Sensors, require_measured
 from ..observer.units import in_sizes
 from ..uncertainty import UncertainModels
@@ -217,9 +216,7 @@ def certified(
 ) -> dict[str, Design]:
     """Certify observers as nonlinear ones, a lifting side by side, and on the set."""
     pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
-    groups = dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]]()
-    for task, design in pairs:
-        groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
+    groups = grouped(pairs, lambda pair: (pair[0].models.name, pair[1].observer.lifting))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
     linear = [partial(certificate, task, design) for task, design in pairs]
     results: list[Any] = work.run("certify", [*nonlinear, *linear])  # the first ones take longest

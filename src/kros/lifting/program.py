@@ -21,6 +21,7 @@ Tree = tuple[Any, ...]
 _NUMPY = {"Abs": "abs", "atan": "arctan"}
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "Abs", "sign", "atan")
 _KINDS = ("add", "multiply", "divide", "power", *FUNCTIONS)  # in the order of loops.c
+_UFUNCS: list[np.ufunc] = [getattr(np, _NUMPY.get(kind, kind)) for kind in _KINDS]
 
 
 @frozen
@@ -55,9 +56,8 @@ class Program:
 
     @cached_property
     def _steps(self) -> list[tuple[Callable[..., Any], int, tuple[int, ...]]]:
-        rows = [(_KINDS[kind], into, operands) for kind, into, *operands in self.code.tolist()]
-        steps = ((k, into, tuple(i[:1] if k in FUNCTIONS else i)) for k, into, i in rows)
-        return [(getattr(np, _NUMPY.get(k, k)), into, i) for k, into, i in steps]
+        rows = ((_UFUNCS[kind], into, operands) for kind, into, *operands in self.code.tolist())
+        return [(function, into, tuple(operands[: function.nin])) for function, into, operands in rows]
 
 
 @dataclass

@@ -113,8 +113,9 @@ class StateSpace:
 
     def __getitem__(self, index: Any) -> StateSpace:
         """Return one system, or a smaller batch, of a batch."""
-        shape, matrices = self.batch_shape, (getattr(self, name) for name in "ABCD")
-        return StateSpace(*(np.broadcast_to(M, shape + M.shape[-2:])[index] for M in matrices), dt=self.dt)
+        shape, matrices = self.batch_shape, (self.A, self.B, self.C, self.D)
+        A, B, C, D = (np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in matrices)
+        return StateSpace(A, B, C, D, self.dt)
 
     def poles(self) -> AnyArray:
         """Return the eigenvalues of A, shape (..., n)."""
@@ -192,5 +193,5 @@ def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
         periods = [s.dt for s in systems]
         raise DimensionError(f"Block diagonal: needs one sampling period, found {periods} s; resample first.")
 
-    matrices = (block_diag(*(getattr(s, name) for s in systems)) for name in "ABCD")
-    return StateSpace(*matrices, dt=systems[0].dt)
+    A, B, C, D = (block_diag(*(getattr(s, name) for s in systems)) for name in "ABCD")
+    return StateSpace(A, B, C, D, systems[0].dt)

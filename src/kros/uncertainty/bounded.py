@@ -231,7 +231,8 @@ def stack_systems(models: Any) -> StateSpace:
         B, C = np.pad(system.B, (more, (0, 0))), np.pad(system.C, ((0, 0), more))
         return np.pad(system.A, more), B, C, system.D
 
-    return StateSpace(*map(np.stack, zip(*map(padded, systems), strict=True)), dt=systems[0].dt)
+    A, B, C, D = map(np.stack, zip(*map(padded, systems), strict=True))
+    return StateSpace(A, B, C, D, systems[0].dt)
 
 
 def check_scale(side: str, values: ArrayLike | None, size: int) -> AnyArray:

@@ -266,6 +266,8 @@ class _Reduced:
 def fitted(models: ModelSet, factor: Factor) -> ModelSet:
     """Return a set of models fitted to factors of its units, with its regularisation."""
     matrices = models.fit(factor.R)
-    radius = models.ranges.normalise(matrices).spectral_radius()
-    status = tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius)
-    return replace(models, A=matrices.A, B=matrices.B, status=status)
+    models = replace(models, A=matrices.A, B=matrices.B)
+    radii = models.spectral_radius()
+    return replace(
+        models, status=tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radii)
+    )

@@ -61,6 +61,11 @@ def squared(values: AnyArray) -> AnyArray:
     return values.real**2 + values.imag**2 if np.iscomplexobj(values) else values**2
 
 
+def energy(matrices: AnyArray) -> AnyArray:
+    """Return the squared Frobenius norms, shape (...), of matrices of shape (..., p, m)."""
+    return squared(matrices).sum(axis=(-2, -1))
+
+
 def sigma_max(matrices: ArrayLike) -> AnyArray:
     """Return the largest singular value, shape (...), of matrices of shape (..., p, m).
 

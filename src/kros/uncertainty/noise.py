@@ -25,7 +25,7 @@ from ..core import (
     frozen,
     save_artifact,
 )
-from ..core.linalg import pieces, sigma_max, squared
+from ..core.linalg import energy, pieces, sigma_max
 from ..identify.edmd import ModelSamples
 from .forms import Form, evenly, residual
 from .settings import OUTLIER
@@ -73,4 +73,4 @@ def noise_share(
 
 def _mean_square(E: AnyArray) -> AnyArray:
     """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
-    return squared(E).sum(axis=(-2, -1)).mean(axis=0)
+    return energy(E).mean(axis=0)

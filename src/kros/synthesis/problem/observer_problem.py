@@ -273,7 +273,7 @@ class ObserverProblem:
         A, B, C, W_p = self.scaled
         n, m, q, J = len(A), B.shape[1], len(C), self.injection_matrix
         B1 = np.hstack([B, np.zeros((n, n + q))])
-        D11 = np.hstack([np.zeros((len(W_p), m)), W_p, np.zeros((len(W_p), q))])
+        D11 = np.pad(W_p, ((0, 0), (m, q)))
         D21 = np.hstack([np.zeros((q, m)), C, np.eye(q)])
         D12, D22 = (np.zeros((rows, J.shape[1])) for rows in (len(W_p), q))
         return GeneralizedPlant(A, B1, -J, W_p, C, D11, D12, D21, D22, self.nominal.dt)

@@ -235,7 +235,7 @@ def residual_h2(
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
     lower, gap, notes = enclosed(norm, problem.lower_bound(full))
     n = len(problem.A)
-    to_lifted = np.vstack([np.diag(problem.scale), np.zeros(((n_lifted or n) - n, n))])
+    to_lifted = np.eye(n_lifted or n, n) * problem.scale
     return Synthesis(
         method="residual_h2",
         controller=gain(to_lifted, problem.dt) @ K,

@@ -24,6 +24,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...core import ITERATED, ROUNDING, AnyArray, StateSpace, SynthesisError, h2_norm
+from ...core.linalg import energy
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from .ball import spread, uncertain_ball
@@ -48,7 +49,7 @@ def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Any
     _, T, certain, noise = _responses(problem, errors, freqs_hz)
     ball = uncertain_ball(problem, freqs_hz)
     response = certain + T @ (ball.center + ball.left @ ball.worst(T, certain) @ ball.right)
-    return np.sum(np.abs(response) ** 2, axis=(-2, -1)) + noise
+    return energy(response) + noise
 
 
 def _responses(
@@ -60,7 +61,7 @@ def _responses(
     d, r, noise, s = np.split(response, [m, m + n, m + n + len(problem.C)], axis=-1)
     T = (d if problem.form.at_input else r) @ problem.W_L.frequency_response(freqs_hz)
     certain = s @ problem.input_weight.frequency_response(freqs_hz) if s.size else 0.0
-    return r, T, certain, np.sum(np.abs(noise) ** 2, axis=(-2, -1))
+    return r, T, certain, energy(noise)
 
 
 def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, float]:

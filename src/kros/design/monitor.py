@@ -64,7 +64,7 @@ def fit_monitor(
             [np.mean(np.minimum(nu[judged] ** 2, np.sqrt(np.finfo(float).max)), axis=0) for nu, judged in every], axis=0
         )
     )
-    if not np.isfinite(size).all() or np.any(size <= 0):
+    if not (np.isfinite(size) & (size > 0)).all():
         return None
     filters = octaves()
     even, forget, first = np.ones((len(size), len(filters))), 1 / settings.memory, 1 / settings.beginning

@@ -191,9 +191,7 @@ def _eigenvalues(left: AnyArray, right: AnyArray) -> AnyArray:
 
 def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
     """Tell whether a form rebuilds every regular unit of a shape exactly."""
-    if form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
-        return form is Form.ADDITIVE or n_outputs == n_inputs
-    return n_outputs <= n_inputs if form.at_input else n_outputs >= n_inputs
+    return (not form.at_input or n_outputs <= n_inputs) and (form.sees_input or n_outputs >= n_inputs)
 
 
 def residual_system(form: Form, G: Descriptor, Gp: Descriptor, remainder: bool) -> Descriptor:

@@ -8,21 +8,7 @@ Examples
 1.0
 """
 
-from .arrays import (
-    AnyArray,
-    Array,
-    ArrayLike,
-    Bits,
-    ByName,
-    Columns,
-    Flags,
-    Names,
-    Parameters,
-    Record,
-    Whole,
-    frozen,
-    grouped,
-)
+from .arrays import AnyArray, Array, ArrayLike, Bits, ByName, Columns, Flags, Names, Parameters, Record, Whole, frozen
 from .artifacts import Storable, digest_of, load_artifact, loader, plain, read_json, save_artifact, united, write_json
 from .errors import (
     ConfigError,
@@ -39,7 +25,7 @@ from .norms import h2_norm, hinf_norm
 from .removed import refusing
 from .rounding import AGREED, EPS, ITERATED, ROUNDING, SINGULAR, TINY
 from .settings import Settings, member, require_kind
-from .work import Executor, Progress, Work
+from .work import Executor, Progress, Work, grouped
 
 __all__ = [
     "ConfigError",

@@ -1,8 +1,8 @@
-"""Types of arrays, of names and of records; objects that hold arrays, and things by what they share."""
+"""Types of arrays, of names and of records, and objects that hold arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, dataclass_transform
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike as ArrayLike
 from numpy.typing import NDArray
 
-K = TypeVar("K")
 T = TypeVar("T")
 AnyArray = NDArray[Any]
 Array = NDArray[np.float64]
@@ -29,11 +28,3 @@ Whole = NDArray[np.int64]
 def frozen(cls: type[T]) -> type[T]:
     """Make a class a frozen dataclass that is compared by identity: arrays have no one truth value."""
     return dataclass(frozen=True, eq=False)(cls)
-
-
-def grouped(items: Iterable[T], by: Callable[[T], K]) -> dict[K, list[T]]:
-    """Return items by what they share, in order."""
-    groups = dict[K, list[T]]()
-    for item in items:
-        groups.setdefault(by(item), []).append(item)
-    return groups

@@ -150,16 +150,17 @@ def hinf_norm(system: Any, tol: float = AGREED) -> float:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = balanced(to_continuous(system) if system.dt > 0 else system)
     known = first_frequencies(continuous.poles())
-    at, lower = max(_largest(system, known), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=itemgetter(1))
+    at, lower = max(_peak(system, known, False), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=itemgetter(1))
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
-    search, room, known = (_largest, tol, known[:0]) if error <= tol else (_peak, error, known)  # as are eigenvalues
+    refined, room = error > tol, max(error, tol)  # eigenvalues are as inaccurate
     for _ in range(_MAX_ITERATIONS):
-        peak, best = search(system, np.concatenate([known, crossings(continuous, lower * (1 + room))]))
+        points = crossings(continuous, lower * (1 + room))
+        peak, best = _peak(system, np.append(known, points) if refined else points, refined)
         before, (at, lower) = lower, max((peak, best), (at, lower), key=itemgetter(1))
         if best <= before * (1 + room):
-            return lower if error <= tol else precise_gain(system, _in_hz(system, at))
+            return precise_gain(system, _in_hz(system, at)) if refined else lower
     problem = f"no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}"
     raise KrosError(f"H-infinity norm: {problem}; scale states and time, or ask for a larger tol than {tol}.")
 
@@ -172,21 +173,18 @@ def to_continuous(system: StateSpace) -> StateSpace:
     return StateSpace(A, np.sqrt(2) * B, np.sqrt(2) * C, system.D - system.C @ B, 0.0)
 
 
-def _largest(system: StateSpace, nu: AnyArray) -> tuple[float, float]:
-    """Return the mapped frequency of the largest gain and that gain."""
+def _peak(system: StateSpace, nu: AnyArray, refined: bool) -> tuple[float, float]:
+    """Return the mapped frequency of the largest gain and that gain, if asked searched for around it."""
+    nu = np.unique(nu)
     gains = _gains(system, nu)
+    if refined:
+        return sharpened(partial(_gains, system), nu, gains)
     best = int(np.argmax(gains))
     return float(nu[best]), float(gains[best])
 
 
-def _peak(system: StateSpace, nu: AnyArray) -> tuple[float, float]:
-    """Return the mapped frequency of the largest gain and that gain, searched for around the largest of those given."""
-    nu = np.unique(nu)
-    return sharpened(partial(_gains, system), nu, _gains(system, nu))
-
-
 def sharpened(size: Callable[[AnyArray], AnyArray], points: AnyArray, values: AnyArray) -> tuple[float, float]:
-    """Return place and height of the largest of the values at increasing points, searched for between its neighbours."""
+    """Return place and height of the largest of values at increasing points, searched for between its neighbours."""
     from scipy.optimize import minimize_scalar
 
     top = int(np.argmax(values))

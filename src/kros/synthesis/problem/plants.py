@@ -10,8 +10,9 @@ For every form, with the perturbed plant in it (`observer_problem`) and the obse
                                                                           y  = C e + n,   u = K y
 
 *Why this is minimal.* With ``x = G s + ...`` the state of the perturbed plant and ``x_hat+ = A x_hat + B s + J u`` the
-observer, both are driven by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one drops out, and the other
-one remains only where the perturbation sees the state, through ``x``. Likewise W_u remains for what Delta sees alone.
+observer, both are driven by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one
+drops out, and the other one remains only where the perturbation sees the state, through ``x``. Likewise W_u remains for
+what Delta sees alone.
 The interconnection has every block once, so with minimal weights the whole is minimal but for poles that cancel between
 blocks.
 

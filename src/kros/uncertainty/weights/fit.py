@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 
 from ...core import AnyArray, Flags, StateSpace, block_diagonal, frozen, gain
-from ...core.frequency import bilinear_squared, nyquist_hz
+from ...core.frequency import nyquist_hz
 from ...core.linalg import pieces
 from ..forms import Form, completion, evenly, residual
 from ..settings import FIT, PROOF, SET
 from .cover import NEPER_DB, Cover, Weight, optimal_cover
 from .joint import JointProblem, fit_jointly, refit
 from .proof import Certificate, Descriptor, certify, invert, leaves_nothing, residual_system
+from .sections import bilinear_squared
 
 
 def fit_weight(

@@ -48,9 +48,9 @@ from ...core import (
     frozen,
     gain,
 )
-from ...core.frequency import bilinear_squared, check_grid
+from ...core.frequency import check_grid
 from ..settings import MAGNITUDE, WEIGHT
-from .sections import Sections
+from .sections import Sections, bilinear_squared
 
 
 @frozen

@@ -57,7 +57,7 @@ class Baseline:
     measured: Columns
     estimated: Columns
     facts: Record
-    seen: Seen | None = None
+    seen: Seen | None
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Mapping[str, Array]) -> Array:
         """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
@@ -98,7 +98,7 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
     facts = {"status": "tuned", "process_noise_level": 10 ** DEFAULT.levels[first]}
     tuned = {"": replace(filters, Q=filters.Q[first])}
-    return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
+    return Baseline(tuned, models.measured, tuple(range(n)), facts, training.seen)
 
 
 def make_difference(training: TrainingSet, measured: Columns) -> Baseline:
@@ -118,7 +118,7 @@ def make_difference(training: TrainingSet, measured: Columns) -> Baseline:
     errors = [error_percent(one, batch.states[..., estimated], batch.lengths).mean() for one in estimates]
     best = trials[int(np.argmin(errors))]
     facts = {"status": "tuned", "cutoff_hz": best.cutoff_hz}
-    return Baseline({"": best}, measured, estimated, facts, seen=training.seen)
+    return Baseline({"": best}, measured, estimated, facts, training.seen)
 
 
 def make_learned(training: TrainingSet, measured: Columns) -> Baseline:
@@ -128,7 +128,7 @@ def make_learned(training: TrainingSet, measured: Columns) -> Baseline:
     moments = Moments.of(training.one_by_one(), measured, step)
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "the unit under test"}
     estimators = {unit: moments.estimator([unit]) for unit in moments.units} | {"": moments.estimator()}
-    return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)
+    return Baseline(estimators, measured, moments.estimated, facts, training.seen)
 
 
 def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> Baseline:
@@ -139,7 +139,7 @@ def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> B
     folds = [units[k :: DEFAULT.folds] for k in range(min(DEFAULT.folds, len(units)))]
     by_unit = {unit: one for fold in folds for one in [rows.fitted(kind, fold)] for unit in fold} | {"": of_all}
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "units of the fold under test"}
-    return Baseline(by_unit, measured, tuple(of_all.regressors), facts, seen=training.seen)
+    return Baseline(by_unit, measured, tuple(of_all.regressors), facts, training.seen)
 
 
 @frozen
@@ -200,7 +200,7 @@ def make_mean_profile(
 
     by_unit = {unit: without(unit) for unit in (*dict.fromkeys(unit for one in means for unit in one), "")}
     facts = {"status": "averaged", "motions": len(motions), "left_out": "the unit under test"}
-    return Baseline(by_unit, measured, estimated, facts, seen=training.seen)
+    return Baseline(by_unit, measured, estimated, facts, training.seen)
 
 
 def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:

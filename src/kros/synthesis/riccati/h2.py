@@ -113,11 +113,11 @@ def _doubling(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray) -
             G = (G + G.T) / 2
             Ak = Ak @ WA
             if not np.isfinite(H).all():
-                return None
+                break
             if np.linalg.norm(step) <= EPS * np.linalg.norm(H):
                 return H
-    except np.linalg.LinAlgError:
-        return None
+    except LinAlgError:
+        pass
     return None
 
 

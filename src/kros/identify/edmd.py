@@ -205,7 +205,7 @@ class ModelSamples:
 
 def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     """Draw E - 1 of E episodes with replacement, and return how much each counts: (unit, draw, max(n_episodes))."""
-    counts = [int(e) for e in n_episodes]
+    counts = list(n_episodes)
     if not counts or min(counts) < 2 or draws < 2:
         raise DataError(
             f"Resampling episodes: needs at least two episodes of every unit and two draws, found {counts} episodes of "

@@ -16,8 +16,6 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ..core import stamp_of
-
 _log = logging.getLogger(__name__)
 COMPILERS = ("cc", "gcc", "clang")
 _SECONDS = 60.0  # after which a compiler, or a library that is tried, is given up
@@ -91,6 +89,7 @@ def _is_whole(library: Path) -> bool:
 
 def _digest(source: str, flags: tuple[str, ...], compiler: str) -> str:
     """What a library depends on; code for one processor need not run on another that sees the same home."""
+    found = os.stat(compiler)
     processor = Path("/proc/cpuinfo")
     flags_of = (
         [line for line in processor.read_text().splitlines() if line.startswith(("flags", "Features"))]
@@ -101,7 +100,7 @@ def _digest(source: str, flags: tuple[str, ...], compiler: str) -> str:
         source,
         *flags,
         os.path.realpath(compiler),
-        str(stamp_of(Path(compiler))),
+        f"{found.st_size} {found.st_mtime_ns}",
         *os.uname()[::4],
         *flags_of[:1],
     )

@@ -92,11 +92,13 @@ class GeneralizedPlant:
 
     def rows(self, channel: int) -> slice:
         """Rows of z that belong to channel 1 (performance) or 2 (uncertainty)."""
-        return _part(channel, self.n_z1, self.sizes[3])
+        split = self.sizes[3] if self.n_z1 is None else self.n_z1
+        return slice(0, split) if channel == 1 else slice(split, None)
 
     def columns(self, channel: int) -> slice:
         """Columns of w that belong to channel 1 (performance) or 2 (uncertainty)."""
-        return _part(channel, self.n_w1, self.sizes[1])
+        split = self.sizes[1] if self.n_w1 is None else self.n_w1
+        return slice(0, split) if channel == 1 else slice(split, None)
 
     def channel(self, rows: slice | AnyArray, columns: slice | AnyArray) -> GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""
@@ -170,11 +172,6 @@ class GeneralizedPlant:
         A[n:, n:] += K.A
         B, C = np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), np.pad(self.C1, more) + self.D12 @ u_x
         return StateSpace(A, B, C, self.D11 + self.D12 @ u_w, self.dt)
-
-
-def _part(channel: int, first: int | None, size: int) -> slice:
-    end = size if first is None else first
-    return slice(end) if channel == 1 else slice(end, None)
 
 
 def split(system: StateSpace, n_w: int, n_z: int, **parts: int | None) -> GeneralizedPlant:

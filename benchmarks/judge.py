@@ -40,6 +40,7 @@ import numpy as np  # noqa: E402
 from table import FOLDS, LEARNED, LIMITED, say, table  # noqa: E402
 
 import kros  # noqa: E402
+from kros.core import Work  # noqa: E402
 from kros.core.artifacts import write_json  # noqa: E402
 from kros.data import EpisodeBatch, EpisodeKey, Population, from_arrays, split_episodes  # noqa: E402
 from kros.design.baselines import make_learned  # noqa: E402
@@ -200,7 +201,8 @@ class Fold:
             SynthesisSettings(),
             baselines,
             EstimatorSettings(),
-            sensor=sensor,
+            sensor,
+            Work(),
         )
         self.seconds["synthesize"] = time.process_time() - began
         return found

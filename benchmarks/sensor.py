@@ -27,7 +27,7 @@ from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent
 from kros.evaluate.sensor import as_shown
 from kros.identify.calibration import segments_of
-from kros.observer import Sensor, run_observer
+from kros.observer import EstimatorSettings, Sensor, run_observer
 from kros.observer.units import in_sizes
 from kros.plants import HarmonicDrivePopulation
 from kros.uncertainty.quantify import UncertainModels
@@ -75,7 +75,7 @@ def held_out(uncertain: UncertainModels, population: Any, units: list[str]) -> E
 def designs(uncertain: UncertainModels, sensor: dict[str, Sensor]) -> dict[str, Run]:
     """Design and train everything for a sensor."""
     found: dict[str, Run] = {}
-    for task in tasks_of(uncertain, "koopman", methods_of(METHODS), sensor):
+    for task in tasks_of(uncertain, "koopman", methods_of(METHODS, EstimatorSettings()), sensor):
         with contextlib.suppress(SynthesisError):
             own = in_sizes(task.method.design(task).observer, {})
             found[task.method.name] = lambda b, o=own: run_observer(

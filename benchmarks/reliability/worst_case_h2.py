@@ -96,8 +96,6 @@ def random_problem(rng: np.random.Generator) -> ObserverProblem:
             weight(rng, int(rng.integers(0, 3)), n, n, 0.05),
             gain(np.eye(m), 1.0),
         )
-    if rng.random() < 0.25:
-        parts["process_noise"] = scale * 10.0 ** rng.uniform(-4, -1, n)
     problem = ObserverProblem(**parts)
     size = hinf_norm(problem.N, 1e-3)
     return problem if size < 0.9 else replace(problem, W_L=_times(problem.W_L, rng.uniform(0.2, 0.85) / size))
@@ -141,9 +139,7 @@ def attained(problem: ObserverProblem, K: StateSpace, theta: Array, rng: np.rand
         "inverse_input_multiplicative": lambda: W_R @ W_L,
         "inverse_output_multiplicative": lambda: W_R @ W_L,
     }.get(name, lambda: np.zeros((len(theta), M.shape[-2], T.shape[-1])))()
-    noise = np.concatenate(
-        [W_p @ S @ R @ J @ gains * problem.noise, W_p @ S @ R * np.asarray(problem.process_noise)], axis=-1
-    )
+    noise = W_p @ S @ R @ J @ gains * problem.noise
     rest = np.zeros((len(theta), T.shape[-2], m))
     if problem.remainder_left is not None and problem.remainder_right is not None:
         left, right = response(problem.remainder_left, theta), response(problem.remainder_right, theta) @ W_u

@@ -8,7 +8,7 @@ import kros
 from kros.data import EpisodeBatch
 from kros.design.methods import methods_of
 from kros.design.synthesize import tasks_of
-from kros.observer import run_observer
+from kros.observer import EstimatorSettings, run_observer
 from kros.observer.residual import one_step_covariance
 from kros.observer.units import in_sizes
 from kros.plants import DcMotorPopulation
@@ -21,7 +21,7 @@ def uncertain():
 
 
 def task(uncertain, method):
-    return tasks_of(uncertain, "linear_edmd", methods_of([method]))[0]
+    return tasks_of(uncertain, "linear_edmd", methods_of([method], EstimatorSettings()))[0]
 
 
 def percent(estimate, batch):

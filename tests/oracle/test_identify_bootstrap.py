@@ -27,7 +27,7 @@ def data_sets(count: int, episodes: int, samples: int, seed: int) -> np.ndarray:
 
 
 def of(models: ModelSamples) -> np.ndarray:
-    return np.concatenate([models.estimate.A, models.estimate.B], axis=-1).reshape(len(models.unit_ids), -1)
+    return np.concatenate([models.estimate.A, models.estimate.B], axis=-1).reshape(len(models.estimate.A), -1)
 
 
 def bands(
@@ -36,7 +36,7 @@ def bands(
     """Quantiles over the draws of sigma_max of the scaled deviation, and of every entry's magnitude: (unit,
     frequency[, n, m])."""
     off = (
-        np.stack([models.responses(row, freqs, dt) for row in range(len(models.unit_ids))])
+        np.stack([models.responses(row, freqs, dt) for row in range(len(models.estimate.A))])
         - models.estimate.responses(freqs, dt)[:, None]
     )
     spectral = np.linalg.norm(off * input_scale / np.asarray(output_scale)[:, None], ord=2, axis=(-2, -1))

@@ -6,7 +6,7 @@ import pytest
 from drives import DT, lag, servo
 from scipy.optimize import minimize
 
-from kros.core import StateSpace, block_diagonal, gain, h2_norm
+from kros.core import block_diagonal, gain
 from kros.synthesis import Injection, ObserverProblem, Status, worst_case_h2
 from kros.synthesis.worst_case.ball import Ball, dual_bound, spread
 from kros.synthesis.worst_case.certificate import certify, circle_mean, density
@@ -204,20 +204,3 @@ def test_remainder_enters_bound_and_design():
     assert found.worst_case_h2 > plain.worst_case_h2
     assert found.worst_case_h2 <= certify(case, plain.controller)[0] * (1 + 1e-6)
     assert found.lower_bound <= found.worst_case_h2
-
-
-def test_process_noise_enters_design_and_certificate():
-    level = np.array([0.0, 1e-2, 1e-3, 1e-2])
-    quiet, case = problem(6), problem(6, process_noise=level)
-    found, plain = worst_case_h2(case), worst_case_h2(quiet)
-    assert found.lower_bound <= found.worst_case_h2 <= certify(case, plain.controller)[0] * (1 + 1e-4)
-    A, _, C, W_p = case.scaled
-    loop = case.error_system(plain.controller)
-    extra = StateSpace(loop.A, loop.B[:, 7:], loop.C, loop.D[:, 7:], DT)
-    together, alone = certify(case, plain.controller)[0], certify(quiet, plain.controller)[0]
-    assert together**2 == pytest.approx(alone**2 + h2_norm(extra) ** 2, rel=1e-4)
-    z = np.exp(2j * np.pi * 5.0 * DT)
-    R = np.linalg.inv(z * np.eye(4) - A)
-    k = case.to_scaled(plain.controller).frequency_response([5.0])[0]
-    expected = W_p @ np.linalg.inv(np.eye(4) + R @ k @ C) @ R @ np.diag(level / case.output_scale)
-    assert extra.frequency_response([5.0])[0] == pytest.approx(expected, rel=1e-6, abs=1e-12)

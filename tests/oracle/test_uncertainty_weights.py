@@ -12,6 +12,7 @@ from tests.support.residuals import of_function
 
 from kros.core import StateSpace
 from kros.uncertainty import quantify
+from kros.uncertainty.weights.cover import NEPER_DB
 from kros.uncertainty.weights.fit import fit_weight
 
 Array = np.ndarray[Any, Any]
@@ -161,7 +162,7 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
 
     weight, best = fit_weight(of_function(residuals), GRID, 1.0, 1, 0.1)
     assert weight.overbound_db_max == pytest.approx(
-        (weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6
+        (weight.magnitudes(GRID).cost() * NEPER_DB - best.cost() * NEPER_DB).max(), abs=1e-6
     )
 
 

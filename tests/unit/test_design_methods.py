@@ -4,13 +4,14 @@ import logging
 
 from kros.design.baselines import BASELINES
 from kros.design.methods import METHODS, methods_of, preferred, suitable
+from kros.observer import EstimatorSettings
 from kros.report.names import LABELS
 from kros.report.theme import Tone
 from kros.study.config import study_schema
 
 
 def names(wanted, kind):
-    return [method.name for method in suitable(methods_of(wanted), kind)]
+    return [method.name for method in suitable(methods_of(wanted, EstimatorSettings()), kind)]
 
 
 def test_the_choices_of_a_study_are_the_methods_and_the_baselines():

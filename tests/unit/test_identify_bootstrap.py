@@ -21,7 +21,7 @@ def samples(units: int = 2, draws: int = 40, spread: float = 0.02) -> ModelSampl
     drawn = KoopmanMatrices(
         A + spread * rng.normal(size=(units, draws, 2, 2)), B + spread * rng.normal(size=(units, draws, 2, 2))
     )
-    return ModelSamples(tuple(f"u{i}" for i in range(units)), whole, drawn)
+    return ModelSamples(whole, drawn)
 
 
 def test_weights_keep_the_number_of_episodes_and_the_variance_of_a_mean() -> None:

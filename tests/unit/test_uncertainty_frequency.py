@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError
-from kros.core.frequency import bilinear_squared, check_grid, log_grid, nyquist_hz
+from kros.core.frequency import check_grid, log_grid, nyquist_hz
 from kros.uncertainty.weights.magnitude import RationalMagnitude
+from kros.uncertainty.weights.sections import bilinear_squared
 
 DT = 1e-3
 

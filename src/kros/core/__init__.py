@@ -25,7 +25,7 @@ from .norms import h2_norm, hinf_norm
 from .removed import refusing
 from .rounding import AGREED, EPS, ITERATED, ROUNDING, SINGULAR, TINY
 from .settings import Settings, member, require_kind
-from .work import Executor, Progress, Work
+from .work import Executor, Progress, Work, grouped
 
 __all__ = [
     "ConfigError",

@@ -13,7 +13,6 @@ from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 from . import limits
 from .errors import ConfigError, DataError, KrosError
@@ -61,18 +60,6 @@ def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> by
         raise error(f"Reading {path}: {failure}; check the file and its permissions.") from failure
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees the old content or the new, never half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f"{TEMPORARY}{uuid4().hex}")
-    try:
-        draft.write_bytes(content)
-        draft.replace(path)
-    except BaseException:
-        draft.unlink(missing_ok=True)
-        raise
-
-
 @contextmanager
 def draft_beside(folder: Path) -> Iterator[Path]:
     """Give the path of a draft in a folder, to be moved to its place; what is not moved is removed."""
@@ -80,6 +67,13 @@ def draft_beside(folder: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder, ignore_cleanup_errors=True) as temporary:
         os.chmod(temporary, 0o755)  # workers of a cluster may be other users
         yield Path(temporary, "draft")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file so that a reader sees the old content or the new, never half of it."""
+    with draft_beside(path.parent) as draft:
+        draft.write_bytes(content)
+        draft.replace(path)
 
 
 @contextmanager

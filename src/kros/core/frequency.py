@@ -1,10 +1,4 @@
-"""Frequency grids and the variable in which magnitudes of discrete systems are rational.
-
-Symbols
--------
-theta : 2 pi f dt, angle on the unit circle, rad
-tau : tan^2(theta / 2), zero at DC and infinite at Nyquist; equals -w^2 on the unit circle for w = (z - 1) / (z + 1)
-"""
+"""Frequency grids."""
 
 from __future__ import annotations
 
@@ -48,11 +42,3 @@ def check_grid(freqs_hz: ArrayLike, sample_period_s: float | None) -> Array:
         limit = f"the Nyquist frequency {top} Hz of the sampling period {sample_period_s} s"
         raise ConfigError(f"Frequency grid: {freqs[-1]} Hz is above {limit}; end the grid there.")
     return freqs
-
-
-def bilinear_squared(freqs_hz: ArrayLike, sample_period_s: float) -> Array:
-    """Return tau = tan^2(theta / 2); infinity at Nyquist, and full relative precision near DC."""
-    freqs = np.asarray(freqs_hz, dtype=float)
-    half = np.pi * freqs * sample_period_s
-    at_top = np.abs(freqs * sample_period_s - 0.5) <= ROUNDING
-    return np.where(at_top, np.inf, np.tan(np.where(at_top, 0.0, half)) ** 2)

@@ -10,6 +10,12 @@ import numpy as np
 from .arrays import AnyArray, Array, ArrayLike
 
 
+def pieces(count: int, most: int) -> list[slice]:
+    """Return slices of a count, of at most so many and at least one, one after the other."""
+    step = max(1, most)
+    return [slice(start, start + step) for start in range(0, count, step)]
+
+
 def adjoint(matrices: AnyArray) -> AnyArray:
     """Return the Hermitian transposes of matrices, shape (..., n, m)."""
     return np.conj(np.swapaxes(matrices, -1, -2))
@@ -18,9 +24,14 @@ def adjoint(matrices: AnyArray) -> AnyArray:
 def radius_text(value: float) -> str:
     """Return a spectral radius as text, with enough digits to differ from one, for example ``1 - 2.5e-08``."""
     distance = 1 - value
-    if distance == 0 or not 0 < abs(distance) < 1e-4:
+    if not 0 < abs(distance) < 1e-4:
         return f"{value:.6g}"
     return f"1 {'-' if distance > 0 else '+'} {abs(distance):.2g}"
+
+
+def spectral_radius(matrices: AnyArray) -> AnyArray:
+    """Return the largest eigenvalue magnitude of matrices (..., n, n), shape (...); zero of empty ones."""
+    return np.abs(np.linalg.eigvals(matrices)).max(axis=-1, initial=0.0)
 
 
 def qr_triangle(matrix: Array) -> Array:
@@ -48,6 +59,11 @@ def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
 def squared(values: AnyArray) -> AnyArray:
     """Return the squared modulus."""
     return values.real**2 + values.imag**2 if np.iscomplexobj(values) else values**2
+
+
+def energy(matrices: AnyArray) -> AnyArray:
+    """Return the squared Frobenius norms, shape (...), of matrices of shape (..., p, m)."""
+    return squared(matrices).sum(axis=(-2, -1))
 
 
 def sigma_max(matrices: ArrayLike) -> AnyArray:

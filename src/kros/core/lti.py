@@ -16,6 +16,7 @@ import numpy as np
 
 from .arrays import AnyArray, ArrayLike, frozen
 from .errors import DimensionError
+from .linalg import spectral_radius
 
 
 def real_array(name: str, values: Any) -> AnyArray:
@@ -122,11 +123,20 @@ class StateSpace:
 
     def spectral_radius(self) -> AnyArray:
         """Return the largest pole magnitude, shape (...); zero without states."""
-        return np.abs(self.poles()).max(axis=-1, initial=0.0)
+        return spectral_radius(self.A)
 
     def largest_pole(self) -> float:
         """Return the spectral radius, or the largest real part of a pole in continuous time, of one system."""
         return float(self.spectral_radius() if self.dt > 0 else self.poles().real.max(initial=-np.inf))
+
+    def is_finite(self) -> bool:
+        """Tell whether no matrix contains NaN or infinity."""
+        return all(np.isfinite(getattr(self, name)).all() for name in "ABCD")
+
+    def multiplied(self, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
+        """Return the system with its outputs (p,) and inputs (m,) multiplied."""
+        C, D = outputs[:, None] * self.C, outputs[:, None] * self.D * inputs
+        return StateSpace(self.A, self.B * inputs, C, D, self.dt)
 
     def is_stable(self) -> AnyArray:
         """Tell whether every pole is inside the unit circle (or the left half-plane)."""

@@ -17,6 +17,9 @@ Systems & Control Letters 14 (1990) 287-293.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -38,7 +41,7 @@ def as_state_space(system: Any) -> StateSpace:
     if system.batch_shape:
         problem = f"needs one system, found a batch of shape {system.batch_shape}"
         raise DimensionError(f"System norm: {problem}; index it, for example system[0].")
-    if not all(np.isfinite(getattr(system, name)).all() for name in "ABCD"):
+    if not system.is_finite():
         raise KrosError("System norm: the matrices contain NaN or infinity; look at the step that built them.")
     return system
 
@@ -91,24 +94,17 @@ def h2_norm(system: Any) -> float:
     1.0
     """
     system = balanced(as_state_space(system))
-    if system.dt == 0 and np.any(system.D):
+    # Rounding, ``eps ||A||``, decides whether a pole of a balanced system is stable.
+    beyond, rounding = system.largest_pole() - (system.dt > 0), 10 * EPS * np.linalg.norm(system.A)
+    if beyond > rounding or (system.dt == 0 and np.any(system.D)):
         return float("inf")
-    if _near_the_limit(system):
+    if beyond >= -rounding:
         return precise_h2_norm(system)
-    if not system.is_stable():
-        return float("inf")
     squared = float(np.trace(system.C @ gramian(system.A, system.B, system.dt) @ system.C.T))
     dual = float(np.trace(system.B.T @ gramian(system.A.T, system.C.T, system.dt) @ system.B))
     if not abs(squared - dual) <= _AGREE * max(squared, dual):
         return precise_h2_norm(system)
     return float(np.sqrt(max(squared, 0.0) + (np.sum(system.D**2) if system.dt > 0 else 0.0)))
-
-
-def _near_the_limit(system: StateSpace) -> bool:
-    """Whether rounding, ``eps ||A||``, decides if a pole of a balanced system is stable."""
-    poles = system.poles()
-    distance = np.abs(1 - np.abs(poles)) if system.dt > 0 else np.abs(poles.real)
-    return bool((distance <= 10 * EPS * np.linalg.norm(system.A)).any())
 
 
 def balanced(system: StateSpace) -> StateSpace:
@@ -154,16 +150,17 @@ def hinf_norm(system: Any, tol: float = AGREED) -> float:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = balanced(to_continuous(system) if system.dt > 0 else system)
     known = first_frequencies(continuous.poles())
-    at, lower = max(_largest(system, known), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
+    at, lower = max(_peak(system, known, False), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=itemgetter(1))
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
-    search, room, known = (_largest, tol, known[:0]) if error <= tol else (_peak, error, known)  # as are eigenvalues
+    refined, room = error > tol, max(error, tol)  # eigenvalues are as inaccurate
     for _ in range(_MAX_ITERATIONS):
-        peak, best = search(system, np.concatenate([known, crossings(continuous, lower * (1 + room))]))
-        before, (at, lower) = lower, max((peak, best), (at, lower), key=lambda pair: pair[1])
+        points = crossings(continuous, lower * (1 + room))
+        peak, best = _peak(system, np.append(known, points) if refined else points, refined)
+        before, (at, lower) = lower, max((peak, best), (at, lower), key=itemgetter(1))
         if best <= before * (1 + room):
-            return lower if error <= tol else precise_gain(system, _in_hz(system, at))
+            return precise_gain(system, _in_hz(system, at)) if refined else lower
     problem = f"no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}"
     raise KrosError(f"H-infinity norm: {problem}; scale states and time, or ask for a larger tol than {tol}.")
 
@@ -176,26 +173,25 @@ def to_continuous(system: StateSpace) -> StateSpace:
     return StateSpace(A, np.sqrt(2) * B, np.sqrt(2) * C, system.D - system.C @ B, 0.0)
 
 
-def _largest(system: StateSpace, nu: AnyArray) -> tuple[float, float]:
-    """Return the mapped frequency of the largest gain and that gain."""
+def _peak(system: StateSpace, nu: AnyArray, refined: bool) -> tuple[float, float]:
+    """Return the mapped frequency of the largest gain and that gain, if asked searched for around it."""
+    nu = np.unique(nu)
     gains = _gains(system, nu)
+    if refined:
+        return sharpened(partial(_gains, system), nu, gains)
     best = int(np.argmax(gains))
     return float(nu[best]), float(gains[best])
 
 
-def _peak(system: StateSpace, nu: AnyArray) -> tuple[float, float]:
-    """Return the mapped frequency of the largest gain and that gain, searched for around the largest of those given."""
+def sharpened(size: Callable[[AnyArray], AnyArray], points: AnyArray, values: AnyArray) -> tuple[float, float]:
+    """Return place and height of the largest of values at increasing points, searched for between its neighbours."""
     from scipy.optimize import minimize_scalar
 
-    nu = np.unique(nu)
-    gains = _gains(system, nu)
-    best = int(np.argmax(gains))
-    bounds = nu[max(best - 1, 0)], nu[min(best + 1, len(nu) - 1)]
-    options = {"xatol": ITERATED * bounds[1]}
-    peak = minimize_scalar(
-        lambda at: -_gains(system, np.array([at]))[0], bounds=bounds, method="bounded", options=options
-    )
-    return max((float(peak.x), float(-peak.fun)), (float(nu[best]), float(gains[best])), key=lambda pair: pair[1])
+    top = int(np.argmax(values))
+    ends = points[max(top - 1, 0)], points[min(top + 1, len(points) - 1)]
+    options = {"xatol": ITERATED * ends[1]}
+    best = minimize_scalar(lambda at: -size(np.array([at])).max(), bounds=ends, method="bounded", options=options)
+    return max((float(best.x), float(-best.fun)), (float(points[top]), float(values[top])), key=itemgetter(1))
 
 
 def _in_hz(system: StateSpace, nu: Any) -> Any:
@@ -246,7 +242,7 @@ def crossings(system: StateSpace, gamma: float) -> AnyArray:
 
 
 def precise_h2_norm(system: StateSpace) -> float:
-    """H2 norm by eigenvectors of A, infinite where a pole is not stable; digits double until two results agree."""
+    """H2 norm, infinite where a pole is not stable; digits double until two results agree."""
     import mpmath
 
     if system.n_states > _MOST_STATES:
@@ -264,22 +260,18 @@ def precise_h2_norm(system: StateSpace) -> float:
 
 
 def _norm_of(mp: Any, system: StateSpace) -> float:
-    """``tr(C P C^T + D D^T)``, ``P = V X V^H``, ``X_ij = M_ij / (1 - l_i l_j*)`` or ``-M_ij / (l_i + l_j*)``."""
-    n, discrete = system.n_states, system.dt > 0
-    A, B, C = (mp.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C))
-    poles, V = mp.eig(A)
-    limit = mp.mpf(10) ** (-mp.mp.dps // 3)  # an eigenvalue of multiplicity three is known to a third of the digits
-    if any(abs(p) >= 1 - limit if discrete else mp.re(p) >= -limit * max(abs(q) for q in poles) for p in poles):
-        return float("inf")
-    W = mp.lu_solve(V, B) if B.cols == 1 else mp.inverse(V) * B
-    M, G = W * W.transpose_conj(), C * V
-    X = mp.matrix(n, n)
-    for i in range(n):
-        for j in range(n):
-            other = mp.conj(poles[j])
-            X[i, j] = M[i, j] / (1 - poles[i] * other if discrete else -(poles[i] + other))
-    squared = sum(mp.re((G[i, :] * X * G[i, :].transpose_conj())[0, 0]) for i in range(C.rows))
-    return float(mp.sqrt(squared + (mp.mpf(float(np.sum(system.D**2))) if discrete else 0)))
+    """``tr(C P C' + D D')``, the Gramian P summed by doubling; infinite where powers of A do not vanish."""
+    A, B, C, D = (mp.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C, system.D))
+    if system.dt == 0:  # the bilinear map keeps the Gramian
+        inverse = mp.inverse(mp.eye(A.rows) - A)
+        A, B = inverse * (mp.eye(A.rows) + A), mp.sqrt(2) * inverse * B
+    P = B * B.T
+    for _ in range(2 * mp.mp.dps):
+        if mp.mnorm(A) <= mp.eps:
+            square = C * P * C.T + D * D.T
+            return float(mp.sqrt(sum(square[i, i] for i in range(C.rows))))
+        P, A = P + A * P * A.T, A * A
+    return float("inf")
 
 
 def precise_gain(system: StateSpace, freq_hz: float) -> float:
@@ -291,5 +283,4 @@ def precise_gain(system: StateSpace, freq_hz: float) -> float:
         point = mpmath.exp(s * mpmath.mpf(system.dt)) if system.dt > 0 else s
         A, B, C, D = (mpmath.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C, system.D))
         response = C * mpmath.inverse(point * mpmath.eye(system.n_states) - A) * B + D
-        values = np.array([[complex(response[i, j]) for j in range(response.cols)] for i in range(response.rows)])
-    return float(np.linalg.norm(values, 2))
+        return float(np.linalg.norm(np.array(response.tolist(), complex), 2))

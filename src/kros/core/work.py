@@ -144,3 +144,11 @@ class Work:
         """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""
         results = self.map(title, call, work)
         return lambda: list(results)
+
+
+def grouped(items: Iterable[T], by: Callable[[T], Any]) -> dict[Any, list[T]]:
+    """Return items by what they share, in order."""
+    groups = dict[Any, list[T]]()
+    for item in items:
+        groups.setdefault(by(item), []).append(item)
+    return groups

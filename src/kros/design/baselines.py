@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, SynthesisError, frozen
+from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, SynthesisError, frozen, grouped
 from ..data import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
@@ -57,13 +57,12 @@ class Baseline:
     measured: Columns
     estimated: Columns
     facts: Record
-    seen: Seen | None = None
+    seen: Seen | None
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Mapping[str, Array]) -> Array:
         """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
-        units = dict[str, list[int]]()
-        for i, key in enumerate(keys):
-            units.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
+        names = [key.unit if key.unit in self.by_unit else "" for key in keys]
+        units = grouped(range(len(keys)), names.__getitem__)
         samples, parts = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), list[Array]()
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
@@ -93,13 +92,13 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
     short = batch.head(DEFAULT.extended_samples)
     estimates = filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
     percents = [error_percent(estimate, short.states, short.lengths).mean(axis=0) for estimate in estimates]
-    bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
-    first = min(range(len(bounded)), key=lambda i: rank(bounded[i], np.full(n, 100.0), models.measured))
-    if not np.isfinite(bounded[first]).all():
+    ranks = [rank(np.where(np.isfinite(p), p, np.inf), np.full(n, 100.0), models.measured) for p in percents]
+    first = ranks.index(min(ranks))
+    if not np.isfinite(ranks[first][1]):
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
     facts = {"status": "tuned", "process_noise_level": 10 ** DEFAULT.levels[first]}
     tuned = {"": replace(filters, Q=filters.Q[first])}
-    return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
+    return Baseline(tuned, models.measured, tuple(range(n)), facts, training.seen)
 
 
 def make_difference(training: TrainingSet, measured: Columns) -> Baseline:
@@ -119,7 +118,7 @@ def make_difference(training: TrainingSet, measured: Columns) -> Baseline:
     errors = [error_percent(one, batch.states[..., estimated], batch.lengths).mean() for one in estimates]
     best = trials[int(np.argmin(errors))]
     facts = {"status": "tuned", "cutoff_hz": best.cutoff_hz}
-    return Baseline({"": best}, measured, estimated, facts, seen=training.seen)
+    return Baseline({"": best}, measured, estimated, facts, training.seen)
 
 
 def make_learned(training: TrainingSet, measured: Columns) -> Baseline:
@@ -129,7 +128,7 @@ def make_learned(training: TrainingSet, measured: Columns) -> Baseline:
     moments = Moments.of(training.one_by_one(), measured, step)
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "the unit under test"}
     estimators = {unit: moments.estimator([unit]) for unit in moments.units} | {"": moments.estimator()}
-    return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)
+    return Baseline(estimators, measured, moments.estimated, facts, training.seen)
 
 
 def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> Baseline:
@@ -140,7 +139,7 @@ def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> B
     folds = [units[k :: DEFAULT.folds] for k in range(min(DEFAULT.folds, len(units)))]
     by_unit = {unit: one for fold in folds for one in [rows.fitted(kind, fold)] for unit in fold} | {"": of_all}
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "units of the fold under test"}
-    return Baseline(by_unit, measured, tuple(of_all.regressors), facts, seen=training.seen)
+    return Baseline(by_unit, measured, tuple(of_all.regressors), facts, training.seen)
 
 
 @frozen
@@ -201,7 +200,7 @@ def make_mean_profile(
 
     by_unit = {unit: without(unit) for unit in (*dict.fromkeys(unit for one in means for unit in one), "")}
     facts = {"status": "averaged", "motions": len(motions), "left_out": "the unit under test"}
-    return Baseline(by_unit, measured, estimated, facts, seen=training.seen)
+    return Baseline(by_unit, measured, estimated, facts, training.seen)
 
 
 def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:

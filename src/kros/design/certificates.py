@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core import TINY, Array, Record, StateSpace, SynthesisError, frozen, gain
-from ..data import EpisodeBatch, EpisodeKey
+from ..core import TINY, Array, Record, StateSpace, SynthesisError, frozen, gain, grouped
+from ..data import EpisodeBatch
 from ..evaluate.errors import error_rms
 from ..identify import ModelSet
 from ..loops import recursion
@@ -79,9 +79,8 @@ def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
 def certified_on(task: DesignTask) -> list[EpisodeBatch]:
     """Return the starts of the first episodes of units, all of short ones, and the same of other conditions."""
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
-    others = dict[str, list[EpisodeKey]]()
-    for key in (k for k in task.recordings.keys if k.condition not in home and k.unit in units):
-        others.setdefault(key.condition, []).append(key)
+    elsewhere = (k for k in task.recordings.keys if k.condition not in home and k.unit in units)
+    others = grouped(elsewhere, lambda key: key.condition)
     batches = []
     for training in (task.training, *(replace(task.recordings, keys=tuple(keys)) for keys in others.values())):
         firsts = {key.unit: key for key in reversed(training.keys)}
@@ -155,8 +154,8 @@ def certify_model(
     """Certify one observer everywhere, or where slopes have no global bound in an operating box around recordings."""
     certificate, models = relift_certificate(observer, scales=scales), task.models
     if certificate.status is ReliftStatus.UNBOUNDED:
-        signals = [np.concatenate([b.states, b.inputs], axis=-1)[b.inside] for b in batches]
-        low, high = (end([end(part, axis=0) for part in signals], axis=0) for end in (np.min, np.max))
+        signals = np.concatenate([np.concatenate([b.states, b.inputs], axis=-1)[b.inside] for b in batches])
+        low, high = signals.min(axis=0), signals.max(axis=0)
         middle, half = (low + high) / 2, DEFAULT.box * (high - low) / 2
         ends = zip((middle - half).tolist(), (middle + half).tolist(), strict=True)
         box = dict(zip((*observer.recorded, *models.recorded_inputs), ends, strict=True))

@@ -16,7 +16,8 @@ from itertools import combinations, product
 
 import numpy as np
 
-from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen
+from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen, grouped
+from ..core.linalg import spectral_radius
 from ..observer import Observer, run_innovations, spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
@@ -63,7 +64,7 @@ def fit_monitor(
             [np.mean(np.minimum(nu[judged] ** 2, np.sqrt(np.finfo(float).max)), axis=0) for nu, judged in every], axis=0
         )
     )
-    if not np.isfinite(size).all() or np.any(size <= 0):
+    if not (np.isfinite(size) & (size > 0)).all():
         return None
     filters = octaves()
     even, forget, first = np.ones((len(size), len(filters))), 1 / settings.memory, 1 / settings.beginning
@@ -82,12 +83,12 @@ def fit_monitor(
 
 def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[Group, TrainingSet]]:
     """Take some episodes of some units, by unit and condition."""
-    groups = list(dict.fromkeys((key.unit, key.condition) for key in training.keys))
-    units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), settings.units))
-    for unit, condition in (group for group in groups if group[0] in units):
-        keys = [key for key in training.keys if (key.unit, key.condition) == (unit, condition)]
-        population = training.population.select([unit], [condition])
-        yield (unit, condition), replace(training, keys=tuple(spread(keys, settings.episodes)), population=population)
+    groups = grouped(training.keys, lambda key: (key.unit, key.condition))
+    units = spread(list(dict.fromkeys(unit for unit, _ in groups)), settings.units)
+    for (unit, condition), keys in groups.items():
+        if unit in units:
+            some, population = tuple(spread(keys, settings.episodes)), training.population.select([unit], [condition])
+            yield (unit, condition), replace(training, keys=some, population=population)
 
 
 def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judged]:
@@ -153,6 +154,6 @@ def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
     """Return the samples in which a start is forgotten, by the slowest mode of the observer's linear part."""
     n, r, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted
     step = observer.one_step[:, [*range(n), *range(nl, nl + r)]]
-    radius = float(np.abs(np.linalg.eigvals(step)).max(initial=0.0))
+    radius = float(spectral_radius(step))
     samples = settings.settle[1] if radius >= 1 else np.log(settings.forgotten) / np.log(max(radius, ITERATED))
     return int(np.clip(np.ceil(samples), *settings.settle)) + observer.runtime.delay

@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, ConfigError, Record, SynthesisError, Work, frozen, plain, require_kind
+from ..core import Array, ByName, ConfigError, Record, SynthesisError, Work, frozen, grouped, plain, require_kind
 from ..data import scaling_of
 from ..identify import IdentifiedModels, ModelSet
-from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor, Sensors, require_measured
 from ..observer.units import in_sizes
 from ..uncertainty import UncertainModels
@@ -109,11 +108,12 @@ def synthesize(
     compared = ObserverSettings.of(observer or {}, "Synthesize, observer")
     regression = EstimatorSettings.of(estimator or {}, "Synthesize, estimator")
     sensors = {name: Sensor.of(one, f"Synthesize, sensor.{name}") for name, one in (sensor or {}).items()}
+    work = work or Work()
     if method is None:
-        every = synthesize_all(uncertain, options, compared, regression, sensors, work=work)
+        every = synthesize_all(uncertain, options, compared, regression, sensors, work)
         return every.designs[every.deployed]
     kind, chosen = _named(uncertain, method, regression)
-    tasks, work = tasks_of(uncertain, kind, [chosen], sensors), work or Work()
+    tasks = tasks_of(uncertain, kind, [chosen], sensors)
     designs, failed = _designed(tasks, work)
     name = f"{kind}/{chosen.name}"
     if name in failed:
@@ -123,15 +123,13 @@ def synthesize(
 
 def synthesize_all(
     uncertain: UncertainModels,
-    settings: SynthesisSettings | None = None,
-    observer: ObserverSettings | None = None,
-    estimator: EstimatorSettings | None = None,
-    sensor: Sensors | None = None,
-    *,
-    work: Work | None = None,
+    settings: SynthesisSettings,
+    observer: ObserverSettings,
+    estimator: EstimatorSettings,
+    sensor: Sensors,
+    work: Work,
 ) -> Designs:
     """Design all observers that settings ask for, certify them, and choose the one that is deployed."""
-    settings, observer, work = settings or SynthesisSettings(), observer or ObserverSettings(), work or Work()
     methods = methods_of((*observer.baselines, *settings.methods), estimator)
     tasks = [task for kind in uncertain.models.kinds for task in tasks_of(uncertain, kind, methods, sensor)]
     designs, failed = _designed(tasks, work)
@@ -218,9 +216,7 @@ def certified(
 ) -> dict[str, Design]:
     """Certify observers as nonlinear ones, a lifting side by side, and on the set."""
     pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
-    groups = dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]]()
-    for task, design in pairs:
-        groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
+    groups = grouped(pairs, lambda pair: (pair[0].models.name, pair[1].observer.lifting))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
     linear = [partial(certificate, task, design) for task, design in pairs]
     results: list[Any] = work.run("certify", [*nonlinear, *linear])  # the first ones take longest

@@ -187,8 +187,7 @@ class DesignTask:
         """Return which observer ranks first on training episodes (`validation.rank`), and its error to open loop."""
         limit, *errors = percent_of([self.observer(self.open_loop()), *observers], self.training.read())
         ranks = [rank(error, limit, self.models.measured) for error in errors]
-        first = min(range(len(ranks)), key=lambda i: ranks[i])
-        return first, ranks[first][1]
+        return ranks.index(min(ranks)), min(ranks)[1]
 
 
 def split_name(observer: str) -> tuple[str, str]:

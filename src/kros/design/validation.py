@@ -9,7 +9,7 @@ from itertools import chain, zip_longest
 
 import numpy as np
 
-from ..core import TINY, Array, frozen
+from ..core import TINY, Array, frozen, grouped
 from ..data import EpisodeBatch, EpisodeKey, Population
 from ..data.prepare import scale_population
 from ..evaluate.errors import error_rms, largest
@@ -58,9 +58,8 @@ class TrainingSet:
         """Take all training episodes of pooled units, one of every unit and condition before the second of any."""
         facts = identified.facts
         parameters = {u: identified.parameters[u] for u in facts.pooled if u in models.unit_ids}
-        groups = dict[tuple[str, str], list[EpisodeKey]]()
-        for key in (key for unit in parameters for key in facts.keys("train", unit)):
-            groups.setdefault((key.unit, key.condition), []).append(key)
+        trained = (key for unit in parameters for key in facts.keys("train", unit))
+        groups = grouped(trained, lambda key: (key.unit, key.condition))
         keys = tuple(k for turn in zip_longest(*groups.values()) for k in turn if k is not None)
         population, seen = identified.population.select(list(parameters)), seen_by(identified, models.measured)
         return cls(population, keys, parameters, seen, sensor or {})

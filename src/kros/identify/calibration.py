@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..core import TINY, Array, Flags, IdentificationError, Storable, Work, digest_of
+from ..core import Array, Flags, IdentificationError, Storable, Work, digest_of
 from ..data import EpisodeKey, Population, split_episodes
 from .survey import RecordingFacts
 
@@ -115,14 +115,14 @@ def wrap(angle: float) -> float:
 
 def find_segments(angle: Array, reference: Array, measured: Array, dt: float, spec: PhaseSpec) -> list[Segment]:
     """Find the constant-velocity segments of an episode, signals (n_samples,), and the phase of the error in each."""
-    there = np.isfinite(angle) & np.isfinite(reference) & np.isfinite(measured)
-    angle, reference, measured = (np.where(there, signal, 0.0) for signal in (angle, reference, measured))
-    top = np.max(np.abs(reference))
+    signals = np.array([angle, reference, measured])
+    angle, reference, measured = np.where(np.isfinite(signals).all(axis=0), signals, 0.0)
+    top = float(np.max(np.abs(reference)))
     if top == 0:
         return []
     constant = np.abs(np.diff(reference, prepend=reference[:1])) < spec.steady * top / len(reference)
     steady = constant & (np.abs(reference) > spec.least_speed * top)
-    per_reference = _speed_per_reference(angle, reference, steady, dt)
+    per_reference = _speed_per_reference(angle, reference / top, steady) / (dt * top)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
     segments = []
     for start, stop in zip(edges[::2] + round(spec.settle * len(reference)), edges[1::2], strict=True):
@@ -133,13 +133,12 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
     return segments
 
 
-def _speed_per_reference(angle: Array, reference: Array, steady: Flags, dt: float) -> float:
-    """Speed of the angle over the reference: one where their units of measure match, zero where nothing moves."""
+def _speed_per_reference(angle: Array, reference: Array, steady: Flags) -> float:
+    """Change of the angle in a sample over the reference, zero where nothing moves."""
     moving = steady[:-1] & steady[1:]
-    top = max(float(np.max(np.abs(reference))), TINY)
-    speed = reference[:-1][moving] / top
+    speed = reference[:-1][moving]
     power = float(speed @ speed)
-    return float(speed @ np.diff(angle)[moving]) / (power * dt * top) if power else 0.0
+    return float(speed @ np.diff(angle)[moving]) / power if power else 0.0
 
 
 def _error_phase(turn: Array, error: Array) -> float:

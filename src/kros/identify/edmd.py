@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core import EPS, TINY, AnyArray, Array, ArrayLike, DataError, IdentificationError, StateSpace, frozen
-from ..core.linalg import qr_triangle
+from ..core.linalg import qr_triangle, spectral_radius
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class KoopmanMatrices:
 
     def spectral_radius(self) -> Array:
         """Return the largest eigenvalue magnitude of each A."""
-        return np.abs(np.linalg.eigvals(self.A)).max(axis=-1)
+        return spectral_radius(self.A)
 
     def responses(self, freqs_hz: Array, sample_period_s: float) -> AnyArray:
         """Return frequency responses from inputs to lifted states, shape (..., frequency, n, m)."""
@@ -195,7 +195,6 @@ def _stable_without(factors: list[tuple[Array, int]], margin: float) -> bool:
 class ModelSamples:
     """Models of resampled episodes around an estimate."""
 
-    unit_ids: tuple[str, ...]
     estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
     samples: KoopmanMatrices  # A (unit, draw, n, n) and B (unit, draw, n, m)
 
@@ -206,7 +205,7 @@ class ModelSamples:
 
 def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     """Draw E - 1 of E episodes with replacement, and return how much each counts: (unit, draw, max(n_episodes))."""
-    counts = [int(e) for e in n_episodes]
+    counts = list(n_episodes)
     if not counts or min(counts) < 2 or draws < 2:
         raise DataError(
             f"Resampling episodes: needs at least two episodes of every unit and two draws, found {counts} episodes of "
@@ -219,9 +218,7 @@ def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     return weights
 
 
-def bootstrap_edmd(
-    R: Array, n_lifted: int, alpha: float, weights: Array, unit_ids: Sequence[str] | None = None
-) -> ModelSamples:
+def bootstrap_edmd(R: Array, n_lifted: int, alpha: float, weights: Array) -> ModelSamples:
     """Return EDMD models of resampled episodes at a fixed alpha, from factors (unit, episode, k, k) and weights."""
     units, episodes, width, _ = R.shape
     models = []
@@ -229,5 +226,4 @@ def bootstrap_edmd(
         stacked = (np.sqrt(draw)[..., None, None] * R).reshape(units, episodes * width, width)
         models.append(edmd(qr_triangle(stacked), n_lifted, alpha))
     drawn = KoopmanMatrices(*(np.stack([getattr(m, name) for m in models[1:]], axis=1) for name in ("A", "B")))
-    ids = tuple(map(str, range(units) if unit_ids is None else unit_ids))
-    return ModelSamples(ids, models[0], drawn)
+    return ModelSamples(models[0], drawn)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core import Array, ArrayLike, DimensionError
 from ..lifting import Lifting
-from ..loops import Library, formulas, library
+from ..loops import formulas, library
 
 
 def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, ArrayLike], x0: Array, u: Array) -> Array:
@@ -62,7 +62,13 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Arra
     lifting.window.require(n_samples)
     rows, window = np.concatenate([A, B], axis=-1)[..., :n, :], lifting.windows(first, u[:, : h + 1])[:, 0].copy()
     if (loops := library()) is not None:
-        return _compiled(loops, rows, window, lifting, parameters, first[:, :h], u)
+        column, states = np.zeros((width + n_lifted, batch)), np.empty((n_samples, n, batch))
+        column[:n], states[:h] = window[:, :n].T, first[:, :h].transpose(1, 2, 0)
+        job = {"observers": 1, "samples": n_samples - h, "batch": batch, "own": rows.ndim == 3, "map": rows}
+        job |= {"u": u[:, h:].transpose(1, 2, 0), "column": column, "states": states[h:]}
+        job["past"] = np.ascontiguousarray(window[:, n:])
+        loops.call("kros_relift", formulas(lifting, parameters, m, batch), ("relift_job", job))
+        return states.transpose(2, 0, 1)
     states = np.empty((batch, n_samples, n))
     states[:, :h] = first[:, :h]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -72,33 +78,3 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Arra
             window[:, n:] = lifting.window.advance(window, u[:, k])
             window[:, :n] = (rows @ np.concatenate([lifted, inputs], axis=1)[..., None])[..., 0]
     return states
-
-
-def _compiled(
-    loops: Library,
-    rows: Array,
-    window: Array,
-    lifting: Lifting,
-    parameters: Mapping[str, ArrayLike],
-    before: Array,
-    u: Array,
-) -> Array:
-    batch, n_samples, m = u.shape
-    n, h = lifting.n_states, lifting.history
-    column = np.zeros((rows.shape[-1], batch))
-    column[:n] = window[:, :n].T
-    states = np.empty((n_samples, n, batch))
-    states[:h] = before.transpose(1, 2, 0)
-    job = {
-        "observers": 1,
-        "samples": n_samples - h,
-        "batch": batch,
-        "own": rows.ndim == 3,
-        "map": rows,
-        "u": u[:, h:].transpose(1, 2, 0),
-        "column": column,
-        "past": np.ascontiguousarray(window[:, n:]),
-        "states": states[h:],
-    }
-    loops.call("kros_relift", formulas(lifting, parameters, m, batch), ("relift_job", job))
-    return states.transpose(2, 0, 1)

@@ -181,6 +181,11 @@ class _Reduced:
         """Units that speak for the population."""
         return np.isin(self.units, list(self.base.facts.pooled))
 
+    @property
+    def rows(self) -> Flags | slice:
+        """Rows of these units; of all where there are none."""
+        return self.pooled if self.pooled.any() else slice(None)
+
     def lifted(self, lifting: Lifting) -> Factor:
         """Return factors for a kind of model."""
         return lifted_factor(self.factor, self.base.lifting, self.parameters, lifting)
@@ -204,8 +209,8 @@ class _Reduced:
 
     def _unfitted(self, kind: str, lifting: Lifting) -> ModelSet:
         population = self.base.population
-        rows = self.pooled if self.pooled.any() else slice(None)
-        ranges, nothing = Ranges.of(self.lifted(lifting), lifting.n_lifted, rows), np.zeros((len(self.units), 0, 0))
+        ranges = Ranges.of(self.lifted(lifting), lifting.n_lifted, self.rows)
+        nothing = np.zeros((len(self.units), 0, 0))
         return ModelSet(
             name=kind,
             condition=self.condition,
@@ -222,16 +227,15 @@ class _Reduced:
 
     def _search(self, sets: list[ModelSet], factors: list[Factor], settings: IdentifySettings) -> float:
         """Return the common regularisation of channels divided by their ranges."""
-        rows = self.pooled if self.pooled.any() else slice(None)
-        triangles = [m.ranges.triangles(factor.R[rows]) for m, factor in zip(sets, factors, strict=True)]
-        shared = [(R, m.lifting.n_lifted) for R, m in zip(triangles, sets, strict=True)]
+        pairs = zip(sets, factors, strict=True)
+        shared = [(m.ranges.triangles(factor.R[self.rows]), m.lifting.n_lifted) for m, factor in pairs]
         edge = smallest_stabilising_alpha(shared)
         search, limit = AlphaSearch(), RefineOptions().largest_residual
         times = search.factor
-        for doubled in range(search.doublings if self.feeds_synthesis and edge > 0 else 0):  # until models are alike
-            models = [edmd(R, n, search.factor * 2.0**doubled * edge) for R, n in shared]
-            if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):
-                times = search.factor * 2.0**doubled
+        for factor in times * 2.0 ** np.arange(search.doublings if self.feeds_synthesis and edge > 0 else 0):
+            models = [edmd(R, n, factor * edge) for R, n in shared]
+            if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):  # they are alike
+                times = float(factor)
                 break
         note = (
             "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
@@ -262,6 +266,8 @@ class _Reduced:
 def fitted(models: ModelSet, factor: Factor) -> ModelSet:
     """Return a set of models fitted to factors of its units, with its regularisation."""
     matrices = models.fit(factor.R)
-    radius = models.ranges.normalise(matrices).spectral_radius()
-    status = tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius)
-    return replace(models, A=matrices.A, B=matrices.B, status=status)
+    models = replace(models, A=matrices.A, B=matrices.B)
+    radii = models.spectral_radius()
+    return replace(
+        models, status=tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radii)
+    )

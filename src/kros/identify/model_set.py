@@ -114,15 +114,14 @@ class ModelSet(Shown, Storable):
     def normalised(self) -> ModelSet:
         """Return the models in channels divided by their ranges, with the lifting of such channels."""
         matrices = self.ranges.normalise(KoopmanMatrices(self.A, self.B))
-        x, u = self.output_scale, self.input_scale
         return replace(
             self,
             lifting=self.lifting.in_sizes(self.sizes),
             channels=tuple(replace(c, unit="") for c in self.channels),
             A=matrices.A,
             B=matrices.B,
-            output_scale=np.ones_like(x),
-            input_scale=np.ones_like(u),
+            output_scale=np.ones_like(self.output_scale),
+            input_scale=np.ones_like(self.input_scale),
         )
 
     def fit(self, R: Array) -> KoopmanMatrices:

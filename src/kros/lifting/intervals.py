@@ -35,17 +35,13 @@ def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
 
 
 def _bounds(expression: Any, box: Box) -> tuple[float, float]:
-    names = sorted(symbol.name for symbol in expression.free_symbols)
+    import sympy as sp
+
+    count = Counter(node.name for node in sp.preorder_traversal(expression) if node.is_Symbol)
+    names = sorted(count)
     sides = {name: _range(name, box.get(name, box.get(base_and_delay(name)[0], (-np.inf, np.inf)))) for name in names}
-    count = Counter(node.name for node in _leaves(expression))
     cut = [name for name in names if count[name] > 1 and 0 < sides[name][1] - sides[name][0] < np.inf]
     return _least(expression, sides, cut, 1), -_least(expression, sides, cut, -1)
-
-
-def _leaves(expression: Any) -> list[Any]:
-    """Return the symbols of a tree as often as they appear."""
-    inner = [leaf for argument in expression.args for leaf in _leaves(argument)]
-    return [expression] if expression.is_Symbol else inner
 
 
 def _range(name: str, value: Any) -> tuple[float, float]:

@@ -226,7 +226,7 @@ class Lifting:
         self, out: Array, program: Program, parameters: Parameters | None, window: Array, u: Array | None = None
     ) -> None:
         """Write the values of a program along the last axis."""
-        program.fill(out, self.parameter_values(parameters) | self.window.columns(program.names, window, u))
+        program.fill(out, self.parameter_values(parameters) | self.window.columns(window, u))
 
 
 @lru_cache

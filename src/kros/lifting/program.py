@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core import Array, ConfigError, frozen
+from ..core import Array, frozen
 
 Codes = npt.NDArray[np.int32]
 Tree = tuple[Any, ...]
 _NUMPY = {"Abs": "abs", "atan": "arctan"}
 FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "Abs", "sign", "atan")
 _KINDS = ("add", "multiply", "divide", "power", *FUNCTIONS)  # in the order of loops.c
+_UFUNCS: list[np.ufunc] = [getattr(np, _NUMPY.get(kind, kind)) for kind in _KINDS]
 
 
 @frozen
@@ -55,9 +56,8 @@ class Program:
 
     @cached_property
     def _steps(self) -> list[tuple[Callable[..., Any], int, tuple[int, ...]]]:
-        rows = [(_KINDS[kind], into, operands) for kind, into, *operands in self.code.tolist()]
-        steps = ((k, into, tuple(i[:1] if k in FUNCTIONS else i)) for k, into, i in rows)
-        return [(getattr(np, _NUMPY.get(k, k)), into, i) for k, into, i in steps]
+        rows = ((_UFUNCS[kind], into, operands) for kind, into, *operands in self.code.tolist())
+        return [(function, into, tuple(operands[: function.nin])) for function, into, operands in rows]
 
 
 @dataclass
@@ -131,17 +131,15 @@ def tree_of(expression: Any) -> Tree:
     if expression.is_Symbol:
         return "symbol", expression.name
     if expression.is_number:
-        return "number", _real(expression)
+        return "number", float(expression)
     if isinstance(expression, sp.Add | sp.Mul):
         children = sorted((tree_of(argument) for argument in expression.args), key=lambda tree: repr(_shape(tree)))
         return ("add" if isinstance(expression, sp.Add) else "multiply", *children)
     if isinstance(expression, sp.Pow) and expression.exp.is_number:
-        return "power", _real(expression.exp), tree_of(expression.base)
+        return "power", float(expression.exp), tree_of(expression.base)
     name = type(expression).__name__
     if name == "DiracDelta":  # the slope of a sign is zero almost everywhere
         return "number", 0.0
-    if name not in FUNCTIONS:
-        raise ConfigError(f"Formula node {expression!r}: is none of {', '.join(sorted(FUNCTIONS))}.")
     return name, tree_of(expression.args[0])
 
 
@@ -151,13 +149,6 @@ def _shape(tree: Tree) -> Tree:
     if kind in ("symbol", "number"):
         return tree if kind == "symbol" else ("number",)
     return (kind, *(_shape(part) if isinstance(part, tuple) else part for part in rest))
-
-
-def _real(number: Any) -> float:
-    try:
-        return float(number)
-    except TypeError as error:
-        raise ConfigError(f"Formula node {number!r}: is not a real number.") from error
 
 
 _SIGNS = {"add": "+", "multiply": "*", "divide": "/"}

@@ -100,15 +100,10 @@ class Window:
         if self.inputs and u.shape[-1] != len(self.inputs):
             raise DimensionError(f"Lifting: expected {len(self.inputs)} inputs {self.inputs} last, found {u.shape}.")
 
-    @cached_property
-    def _places(self) -> dict[str, int]:
-        return {name: i for i, name in enumerate(self.names)}
-
-    def columns(self, names: Iterable[str], window: Array, u: Array | None = None) -> dict[str, Array]:
-        """Return some columns by name, present inputs among them where they are given."""
-        columns = {name: window[..., self._places[name]] for name in names if name in self._places}
-        given = {} if u is None else {name: u[..., i] for i, name in enumerate(self.inputs)}
-        return columns | given
+    def columns(self, window: Array, u: Array | None = None) -> dict[str, Array]:
+        """Return the columns by name, present inputs among them where they are given."""
+        columns = {name: window[..., i] for i, name in enumerate(self.names)}
+        return columns if u is None else columns | {name: u[..., i] for i, name in enumerate(self.inputs)}
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ class FormulaSeparation:
     def evaluate(self, window: Array, u: Array | None = None) -> Array:
         """Return the parameter-free functions at windows (..., n_window), and inputs if given; (..., n_basis)."""
         out = np.moveaxis(np.empty((len(self.basis), *window.shape[:-1])), 0, -1)  # a function's values side by side
-        self._program.fill(out, self.window.columns(self._program.names, window, u))
+        self._program.fill(out, self.window.columns(window, u))
         return out
 
     def matrix(self, parameters: Parameters) -> Array:

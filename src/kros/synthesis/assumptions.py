@@ -32,12 +32,13 @@ PROPER = "D11 = 0 in continuous time", "use a strictly proper weight"
 
 def unreachable_modes(A: AnyArray, B: AnyArray, dt: float) -> list[complex]:
     """Return the eigenvalues on or beyond the stability boundary that B does not reach (Hautus test)."""
-    if A.size:  # A is balanced and B made as large as A, so that the test does not depend on units
-        size = balanced_size(A)
-        A, B = A * size / size[:, None], B / size[:, None]
-        sizes = np.linalg.norm(B, axis=0)
-        B = B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), TINY)
-    modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
+    if not A.size:
+        return []
+    size = balanced_size(A)  # and B is made as large as A, so that the test does not depend on units
+    A, B = A * size / size[:, None], B / size[:, None]
+    sizes = np.linalg.norm(B, axis=0)
+    B = B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), TINY)
+    modes = np.linalg.eigvals(A)
     outside = modes[np.abs(modes) >= 1 - ROUNDING] if dt > 0 else modes[modes.real >= -ROUNDING * (1 + np.abs(modes))]
     pencils = (np.hstack([A - mode * np.eye(len(A)), B]) for mode in outside)
     values = (np.linalg.svd(pencil, compute_uv=False) for pencil in pencils)

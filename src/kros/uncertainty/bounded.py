@@ -203,7 +203,7 @@ def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
         raise ConfigError("Quantify: continuous systems have no weights; sample them, control.sample_system does it.")
     for k, name in enumerate(options.ids(system.batch_shape[0])):
         one = system[k]
-        if not all(np.isfinite(getattr(one, matrix)).all() for matrix in "ABCD"):
+        if not one.is_finite():
             raise DataError(
                 f"Quantify: the model of unit {name} has NaN or infinity; leave it out or identify it again."
             )

@@ -109,7 +109,7 @@ def residual(form: Form | str, nominal: ArrayLike, perturbed: ArrayLike, *, pape
     if G.ndim < 2 or Gp.ndim < 2 or G.shape[-2:] != Gp.shape[-2:]:
         problem = f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}"
         raise DimensionError(f"{problem}; bring them to the same channels.")
-    if not paper or form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
+    if not paper or form.at_input is not form.sees_input:
         return residual_of(form, G, Gp, np.linalg.pinv)
     inverse, other = (np.linalg.pinv(Gp), G) if form.inverse else (np.linalg.pinv(G), Gp)
     product = inverse @ other if form.at_input else other @ inverse

@@ -154,4 +154,4 @@ def scale_system(system: StateSpace, output_scale: AnyArray, input_scale: AnyArr
     if system.n_states == len(output_scale) and np.all(np.eye(system.n_states) == system.C):
         A, B = system.A * output_scale * rows, system.B * rows * input_scale
         return StateSpace(A, B, system.C, system.D * rows * input_scale, system.dt)
-    return StateSpace(system.A, system.B * input_scale, system.C * rows, system.D * rows * input_scale, system.dt)
+    return system.multiplied(1.0 / output_scale, input_scale)

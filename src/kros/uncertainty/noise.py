@@ -22,11 +22,10 @@ import numpy as np
 
 from ..core import (
     AnyArray,
-    DataError,
     frozen,
     save_artifact,
 )
-from ..core.linalg import sigma_max, squared
+from ..core.linalg import energy, pieces, sigma_max
 from ..identify.edmd import ModelSamples
 from .forms import Form, evenly, residual
 from .settings import OUTLIER
@@ -61,15 +60,10 @@ def noise_share(
 ) -> NoiseShare:
     """Compare the residuals between units with those between resampled models, of responses divided by `scale`."""
     (units, draws, _, n), m = models.samples.A.shape, models.samples.B.shape[-1]
-    parts = (models.estimate.A, models.estimate.B, models.samples.A, models.samples.B)
-    for unit, *matrices in zip(models.unit_ids, *parts, strict=True):
-        if not all(np.isfinite(M).all() for M in matrices):
-            problem = f"unit {unit} has a model or a draw that is not finite"
-            raise DataError(f"Noise share: {problem}; leave the unit out, or raise alpha.")
     G = models.estimate.responses(freqs_hz, sample_period_s) / scale  # (unit, frequency, n, m)
-    noise, step = np.zeros(len(freqs_hz)), max(1, OUTLIER.at_once // (draws * n * max(n, m)))
+    noise, blocks = np.zeros(len(freqs_hz)), pieces(len(freqs_hz), OUTLIER.at_once // (draws * n * max(n, m)))
     for row in range(units):
-        for part in (slice(start, start + step) for start in range(0, len(freqs_hz), step)):
+        for part in blocks:
             drawn = models.responses(row, freqs_hz[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += _mean_square(residual(form, drawn, np.roll(drawn, 1, axis=0))) / units
     between = np.mean([_mean_square(residual(form, G[k], G)) for k in evenly(units, OUTLIER.nominals)], axis=0)
@@ -79,4 +73,4 @@ def noise_share(
 
 def _mean_square(E: AnyArray) -> AnyArray:
     """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
-    return squared(E).sum(axis=(-2, -1)).mean(axis=0)
+    return energy(E).mean(axis=0)

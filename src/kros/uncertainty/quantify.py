@@ -35,7 +35,7 @@ from .forms import Form, as_form, residual
 from .model import UncertainModel
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
-from .settings import QuantifySettings, WeightSettings
+from .settings import QuantifySettings
 from .unit_residuals import UnitResiduals, unit_residuals
 
 _KIND = "choice"
@@ -186,16 +186,15 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
         raise IdentificationError(f"{problem}; record more units in the condition that feeds synthesis.")
     responses = first.scaled_responses(first.frequencies(settings.n_freqs), units)
     nominal = settings.nominal or units[choose_nominal(responses, settings.form).index]  # as in the paper, for all
-    weight = {name: getattr(settings, name) for name in WeightSettings.model_fields}
-    options = Options(unit_ids=tuple(units), nominal=nominal, **weight)
-    every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
-    tasks = [partial(bound_systems, *one, options) for one in every]
+    order, tolerance = settings.max_order, settings.tolerance_db
+    options = Options(unit_ids=tuple(units), nominal=nominal, max_order=order, tolerance_db=tolerance)
+    form, every = Form(settings.form), map(models.models, models.kinds)
+    tasks = [partial(bound_systems, one, form, one.frequencies(settings.n_freqs), options) for one in every]
     sets = dict(zip(models.kinds, work.run("quantify", tasks), strict=True))
-    uncertain = sets[first.name]
-    responses = first.scaled_responses(uncertain.freqs_hz, uncertain.unit_ids)
-    peaks = sigma_max(residual(uncertain.form, responses[uncertain.nominal], responses)).max(axis=-1)
-    peaks[uncertain.nominal] = -np.inf
-    worst_off = uncertain.unit_ids[int(np.argmax(peaks))]  # the unit with the largest residual against the nominal one
+    row = units.index(nominal)
+    peaks = sigma_max(residual(form, responses[row], responses)).max(axis=-1)
+    peaks[row] = -np.inf
+    worst_off = units[int(np.argmax(peaks))]  # the unit with the largest residual against the nominal one
     return UncertainModels(models, nominal, worst_off, sets, tuple(scores), outliers)
 
 
@@ -204,4 +203,5 @@ def residuals_beside_weights(models: ModelSet, uncertain: UncertainModel, points
     freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // points)]
     nominal = uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)
     units = dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True))
-    return unit_residuals(uncertain.form, nominal, units, uncertain.weight, freqs, models.sample_period_s)
+    cover = uncertain.weight.magnitudes(freqs)
+    return unit_residuals(uncertain.form, nominal, units, cover, freqs, models.sample_period_s)

@@ -26,7 +26,7 @@ from ..core import (
 from ..core.linalg import sigma_max
 from .forms import Form, residual
 from .settings import SET
-from .weights.cover import Cover, Weight
+from .weights.cover import Cover
 from .weights.magnitude import fit_magnitude
 
 
@@ -45,7 +45,7 @@ class UnitResiduals(Storable):
     largest: AnyArray  # (frequency, p', m'): largest entries of all covered units
     entry_weights: AnyArray  # (frequency, p', m')
     entry_orders: AnyArray  # (p', m')
-    entry_excess: float = float("nan")
+    entry_excess: float
 
     def rows(self, *, inside: bool) -> list[int]:
         """Return rows of the units that are covered, or of those that need not be."""
@@ -56,15 +56,14 @@ def unit_residuals(
     form: Form,
     nominal: tuple[str, AnyArray],
     responses: Mapping[str, AnyArray],
-    weights: Weight | Cover,
+    cover: Cover,
     freqs_hz: AnyArray,
     sample_period_s: float,
     outside: Collection[str] = (),
 ) -> UnitResiduals:
-    """Return residuals of units, whose responses have the shape (frequency, p, m), beside weights or a cover."""
+    """Return residuals of units, whose responses have the shape (frequency, p, m), beside a cover."""
     unit_ids, inside = tuple(responses), np.array([unit not in outside for unit in responses])
     E = residual(form, nominal[1], np.stack(list(responses.values())))
-    cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
     names = form, nominal[0], unit_ids, tuple(unit for unit in unit_ids if unit in outside)
     fitted = fit_entries(E[inside], freqs_hz, sample_period_s, SET.entry_order)
     fit = np.abs(fitted.system.frequency_response(freqs_hz)), fitted.orders, fitted.excess

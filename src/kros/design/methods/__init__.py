@@ -21,11 +21,10 @@ METHODS: tuple[Method, ...] = (
 )
 
 
-def methods_of(names: Iterable[str], estimator: EstimatorSettings | None = None) -> list[Method]:
+def methods_of(names: Iterable[str], estimator: EstimatorSettings) -> list[Method]:
     """Return methods by their names, in the order of all; names of what is no method are left out."""
     wanted = set(names)
-    methods = [method for method in METHODS if method.name in wanted]
-    return [Estimator(estimator) if estimator and isinstance(m, Estimator) else m for m in methods]
+    return [Estimator(estimator) if isinstance(m, Estimator) else m for m in METHODS if m.name in wanted]
 
 
 def suitable(methods: Iterable[Method], kind: str) -> list[Method]:

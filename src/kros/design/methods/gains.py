@@ -81,7 +81,7 @@ def _candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterat
 def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:
     """Add rows of zeros for the lifted functions."""
     K = synthesis.controller
-    return replace(synthesis, controller=gain(np.vstack([K.D, np.zeros((n_lifted - len(K.D), K.n_inputs))]), K.dt))
+    return replace(synthesis, controller=gain(np.pad(K.D, ((0, n_lifted - len(K.D)), (0, 0))), K.dt))
 
 
 @frozen

@@ -26,7 +26,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...core import ITERATED, AnyArray, Array, frozen
-from ...core.linalg import adjoint, entries_first, multiply, sigma_max_first
+from ...core.linalg import adjoint, entries_first, multiply, pieces, sigma_max_first
 
 TIE = ITERATED  # relative; scores closer than rounding are one
 _AT_ONCE = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
@@ -38,25 +38,22 @@ def smallest_largest(shape: tuple[int, int], size: Callable[[AnyArray, AnyArray]
     ``size(candidates, units)`` returns residuals, (row, frequency), for rows that broadcast to that: of a candidate and
     all units, (1, 1) and (row, 1), and of candidates and the witness of every frequency, (row, 1) and (1, frequency).
     """
-    lower, exact, row, step = np.zeros(shape), np.full(shape[0], np.inf), 0, max(1, _AT_ONCE // shape[1])
+    lower, exact, row, most = np.zeros(shape), np.full(shape[0], np.inf), 0, _AT_ONCE // shape[1]
+    every = np.arange(shape[0])[:, None]
     while lower[row].max() <= exact.min() * (1 + TIE):
-        at = np.array([[row]])
-        residuals = np.concatenate([size(at, part) for part in _pieces(np.arange(shape[0]), step)])
+        residuals = np.concatenate([size(every[[row]], every[part]) for part in pieces(shape[0], most)])
         lower[row] = residuals.max(axis=0)
         exact[row] = lower[row].max()
         rows = np.flatnonzero(np.isinf(exact) & (lower.max(axis=1) <= exact.min() * (1 + TIE)))
         if not rows.size:
             break
         witness = residuals.argmax(axis=0)[None]
-        lower[rows] = np.maximum(lower[rows], np.concatenate([size(part, witness) for part in _pieces(rows, step)]))
+        of_witness = np.concatenate([size(every[rows[part]], witness) for part in pieces(len(rows), most)])
+        lower[rows] = np.maximum(lower[rows], of_witness)
         row = int(rows[np.argmin(lower[rows].max(axis=1))])
     least = exact.min()
     index = int(np.argmax(exact <= least + TIE * np.abs(least)))  # the first of those that rounding may have told apart
     return index, lower[index]
-
-
-def _pieces(rows: AnyArray, step: int) -> list[AnyArray]:
-    return np.split(rows[:, None], range(step, len(rows), step))
 
 
 def unit_circle(points: int) -> AnyArray:
@@ -88,7 +85,7 @@ class ResponsePrior:
         left = np.linalg.pinv(G)
         E = left @ (G - G0)
         Z = np.concatenate([G, np.broadcast_to(np.eye(m), (*G.shape[:2], m, m))], axis=-2)
-        return np.asarray(E), left @ Phi, self.T.T @ Z @ (np.eye(m) - E)
+        return E, left @ Phi, self.T.T @ Z @ (np.eye(m) - E)
 
     def normal(self, V: Array) -> Array:
         """Return ``[J r]^T [J r]`` with r = -E, weighted for the gradient of the cost; shape (unit, P + 1, P + 1)."""
@@ -103,10 +100,8 @@ class ResponsePrior:
         H = form.transpose(0, 1, 3, 2, 4).reshape(units, rows * columns, -1)
         pull = adjoint(a) @ (E * slope[..., None, None]) @ adjoint(Z)
         g = -pull.real.sum(axis=1).reshape(units, -1)
-        out = np.empty((units, H.shape[-1] + 1, H.shape[-1] + 1))
-        out[:, :-1, :-1], out[:, :-1, -1], out[:, -1, :-1] = H, g, g
-        out[:, -1, -1] = self.weight * self.level**2 * np.mean(((1 + size) ** self.power - 1) / self.power, axis=1)
-        return out
+        cost = self.weight * self.level**2 * np.mean(((1 + size) ** self.power - 1) / self.power, axis=1)
+        return np.block([[H, g[..., None]], [g[:, None], cost[:, None, None]]])
 
 
 def peak_residual(A: Array, B: Array, points: int = 200) -> float:

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import EPS, TINY, Array, Flags, IdentificationError
-from ...core.linalg import qr_triangle, radius_text
+from ...core.linalg import pieces, qr_triangle, radius_text
 from ...data import EpisodeBatch, EpisodeKey, Population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
@@ -128,7 +128,6 @@ def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tupl
         models = problem.matrices(V[pooled])
         rms, _ = free_run_errors(data, models, pooled.tolist(), held)
         rows.append((float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)))
-        log.debug("prior of strength %g: score %.4g, peak residual %.3g", strength, *rows[-1])
         earlier = rows[-1 - options.patience][0] if len(rows) > options.patience else np.inf
         if rows[-1][0] > (1 - options.tolerance / 2) * earlier or rows[-1][1] > options.largest_residual:
             break
@@ -237,7 +236,7 @@ def free_run_errors(
     """
     lifting, parameters = data.lifting, {name: given[rows] for name, given in data.parameters.items()}
     errors = []
-    for part in (slice(start, start + _TOGETHER) for start in range(0, len(keys), _TOGETHER)):
+    for part in pieces(len(keys), _TOGETHER):
         batch = EpisodeBatch.read(data.population, keys[part])
         values = {name: given[part] for name, given in parameters.items()}
         x, u = (np.ascontiguousarray(np.swapaxes(signal, 0, 1)) for signal in (batch.states, batch.inputs))

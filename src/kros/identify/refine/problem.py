@@ -26,6 +26,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import TINY, Array, Flags, Whole, frozen
+from ...core.linalg import spectral_radius
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
 from ..factors import Factor
@@ -62,10 +63,8 @@ class OneStep:
         G, c = self.matrix[:, :p, :p], self.matrix[:, :p, p + row]
         slope = c - (G @ rows[..., None])[..., 0]
         power = self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1)
-        out = np.empty((len(rows), p + 1, p + 1))
-        out[:, :p, :p], out[:, :p, p], out[:, p, :p] = G, slope, slope
-        out[:, p, p] = np.maximum(power - self.least[:, row], 0.0)
-        return np.asarray(out / self.variance[row])
+        cost = np.maximum(power - self.least[:, row], 0.0)
+        return np.block([[G, slope[..., None]], [slope[:, None], cost[:, None, None]]]) / self.variance[row]
 
 
 @frozen
@@ -124,9 +123,9 @@ class RefinementProblem:
     def admissible(self, V: Array) -> Flags:
         """Return which models are finite and stable as linear systems."""
         A = (V @ self.T.T)[..., : self.lifting.n_lifted]
-        finite = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
-        radius = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], A, 0.0))).max(axis=-1)
-        return np.asarray(finite & (radius < 1 - self.options.margin))
+        finite = np.all(np.isfinite(A), axis=(-1, -2))
+        radius = spectral_radius(np.where(finite[..., None, None], A, 0.0))
+        return finite & (radius < 1 - self.options.margin)
 
     def matrices(self, V: Array) -> KoopmanMatrices:
         """Return A and B of whitened parameters."""
@@ -135,7 +134,7 @@ class RefinementProblem:
 
     def finite(self, V: Array) -> Flags:
         """Return which models hold numbers only."""
-        return np.asarray(np.isfinite(V).all(axis=(-1, -2)))
+        return np.all(np.isfinite(V), axis=(-1, -2))
 
     def run(self, V: Array) -> Normal:
         """Return the normal equations of the free runs alone."""
@@ -149,10 +148,10 @@ class RefinementProblem:
         normal = self.run(V)
         each = np.broadcast_to(V, (len(normal.matrix), nl, p))
         total = np.zeros((len(each), nl * p + 1, nl * p + 1))
-        _add(total, normal.matrix, slice(0, n * p))
+        _add(total, normal.matrix, np.arange(n * p))
         weight = self.options.row_weight * normal.counts[:, None, None]
         for row in range(n, nl):
-            _add(total, weight * self.one_step.normal(each[:, row], row - n), slice(row * p, (row + 1) * p))
+            _add(total, weight * self.one_step.normal(each[:, row], row - n), row * p + np.arange(p))
         total = total.sum(axis=0, keepdims=True) if self.pooled else total
         if self.edged:
             total += stability_barrier(V, self.T, self.options.guard, self.edge_weight)
@@ -167,11 +166,10 @@ def _unexplained(M: Array, p: int) -> Array:
     return np.diagonal(M[p:, p:]) - np.sum(rows * M[:p, p:].T, axis=1)
 
 
-def _add(total: Array, part: Array, place: slice) -> None:
-    total[:, place, place] += part[:, :-1, :-1]
-    total[:, place, -1] += part[:, :-1, -1]
-    total[:, -1, place] += part[:, -1, :-1]
-    total[:, -1, -1] += part[:, -1, -1]
+def _add(total: Array, part: Array, place: Whole) -> None:
+    """Add normal equations of some parameters."""
+    at = np.append(place, -1)
+    total[:, at[:, None], at] += part
 
 
 def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
@@ -186,4 +184,4 @@ def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
     slope = (turn[..., None, None] * left[..., :, None] * columns[..., None, :]).real.reshape(problems, n, n * p)
     J = np.where(excess[..., None] > 0, slope / guard, 0.0)
     rows = np.sqrt(weight) * np.concatenate([J, -excess[..., None]], axis=-1)
-    return np.asarray(np.swapaxes(rows, -1, -2) @ rows)
+    return np.swapaxes(rows, -1, -2) @ rows

@@ -99,7 +99,7 @@ def read_segments(
     """Draw segments of every unit, those of its last episode at the end."""
     n, width, length = len(population.states), len(population.channels), history + horizon + 1
     values = np.empty((length, width, len(keys), count))
-    valid = np.ones((length, len(keys), count), dtype=bool)
+    valid = np.empty((length, len(keys), count), dtype=bool)
     for row, (unit, episodes) in enumerate(keys.items()):
         if not episodes:
             raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out.")
@@ -109,15 +109,10 @@ def read_segments(
         for episode in dict.fromkeys(owners.tolist()):
             key = episodes[episode]
             samples = population.read(key)
-            if len(samples) < history + 2:
-                problem = f"{key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}"
-                raise DataError(f"Refinement: {problem}; leave the episode out or use shorter delays.")
             for column in np.flatnonzero(owners == episode):
-                start = int(rng.integers(0, max(1, len(samples) - length + 1)))
-                piece = samples[start : start + length]
-                values[: len(piece), :, row, column] = piece
-                values[len(piece) :, :, row, column] = piece[-1]
-                valid[len(piece) :, row, column] = False
+                at = int(rng.integers(0, max(1, len(samples) - length + 1))) + np.arange(length)
+                values[..., row, column] = samples[np.minimum(at, len(samples) - 1)]
+                valid[:, row, column] = at < len(samples)
     return Segments(np.ascontiguousarray(values[:, :n]), np.ascontiguousarray(values[:, n:]), valid, history)
 
 

@@ -90,7 +90,7 @@ def _compared(
     assert models.alpha is not None
     ones = Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
     ranges, weights = models.ranges if models.alpha_in_ranges else ones, episode_weights(counts, DEFAULT.draws, 0)
-    samples = bootstrap_edmd(ranges.triangles(factor.R), models.lifting.n_lifted, models.alpha, weights, units)
+    samples = bootstrap_edmd(ranges.triangles(factor.R), models.lifting.n_lifted, models.alpha, weights)
     samples = replace(samples, estimate=ranges.restore(samples.estimate), samples=ranges.restore(samples.samples))
     scale = models.output_scale[:, None] / models.input_scale
     freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s

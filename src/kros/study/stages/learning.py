@@ -124,7 +124,7 @@ def run_synthesize(context: Context) -> None:
     """Design observers by every method that the study names, with their certificates, and choose the deployed one."""
     config, draft = context.config, context.store.draft
     tables = config.synthesis, config.observer, config.estimator, config.sensor
-    designs = synthesize_all(context.uncertain, *tables, work=context.work)
+    designs = synthesize_all(context.uncertain, *tables, context.work)
     for name, design in designs.designs.items():
         observer = replace(design.observer, about={**design.observer.about, "study": config.name})
         observer.save(draft("observers", f"{name}.json"))

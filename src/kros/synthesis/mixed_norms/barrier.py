@@ -77,10 +77,9 @@ def minimise(
     *,
     rtol: float = 1e-5,
     steps: int = 400,
-    box: float = 1e6,
 ) -> Outcome:
     """Minimise over the matrix inequalities, with so many Newton steps at most, to a feasible point and from there."""
-    programme = _Programme(c, blocks, np.full(len(c), box))
+    programme = _Programme(c, blocks, np.full(len(c), 1e6))
     if not programme.holds(start):
         feasible = _find_feasible(programme, start, steps)
         if feasible.x is None:

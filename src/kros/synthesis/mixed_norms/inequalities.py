@@ -35,7 +35,6 @@ from numpy.linalg import cholesky, inv, solve, svd
 from ...core import EPS, TINY, AnyArray, StateSpace, frozen
 from ...core.norms import gramian, h2_norm
 from ..generalized_plant import GeneralizedPlant
-from ..problem.observer_problem import multiplied
 from ..riccati.h2 import balancing, h2
 from .barrier import Block
 
@@ -79,28 +78,16 @@ class MixedInequalities:
         changes = {"z": np.diag(scale), "y": np.diag(1 / measurements), "u": np.diag(controls)}
         return cls(plant.transformed(x=(T, back), **changes), norm, s, controls, measurements)
 
-    @property
-    def shapes(self) -> dict[str, tuple[int, int, bool]]:
-        """Rows, columns and symmetry of every variable, in order."""
-        p = self.plant
-        n, _, n_u, _, n_y = p.sizes
-        n_z1 = p.C1[p.rows(1)].shape[0]
-        shapes = {
-            "X": (n, n, True),
-            "Y": (n, n, True),
-            "An": (n, n, False),
-            "Bn": (n, n_y, False),
-            "Cn": (n_u, n, False),
-        }
-        return shapes | {"Dn": (n_u, n_y, False), "Z": (n_z1, n_z1, True)}
-
     @cached_property
     def places(self) -> Values:
         """Number of the scalar variable behind every entry of every variable."""
+        n, _, n_u, _, n_y = self.plant.sizes
+        n_z1 = len(self.plant.C1[self.plant.rows(1)])
+        shapes = {"X": (n, n), "Y": (n, n), "An": (n, n), "Bn": (n, n_y), "Cn": (n_u, n), "Dn": (n_u, n_y)}
         places, size = {}, 0
-        for name, (rows, columns, symmetric) in self.shapes.items():
+        for name, (rows, columns) in (shapes | {"Z": (n_z1, n_z1)}).items():
             place = np.arange(rows * columns).reshape(rows, columns)
-            if symmetric:
+            if name in ("X", "Y", "Z"):  # symmetric
                 upper, place = np.triu_indices(rows), np.zeros((rows, rows), int)
                 place[upper] = np.arange(len(upper[0]))
                 place = np.maximum(place, place.T)
@@ -148,8 +135,6 @@ class MixedInequalities:
         blocks = [G - _MARGIN * np.eye(2 * n)]
         for channel in (1, 2):
             B, C, D = self._channel(channel, v, scale)
-            if channel == 2 and not (B.shape[-1] and C.shape[-2]):
-                continue
             Bt, Ct, Dt, one = (m.swapaxes(-1, -2) for m in (B, C, D, np.eye(B.shape[-1])))
             zero = np.zeros((2 * n, B.shape[-1]))
             if channel == 1:
@@ -183,7 +168,7 @@ class MixedInequalities:
         B = solve(V, Bn - Y @ p.B2 @ Dn)
         middle = v["An"] + eye - V @ B @ p.C2 @ X - Y @ p.B2 @ C @ U - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
         A = solve(V, solve(U.T, middle.T).T)
-        return multiplied(StateSpace(A, B, C, Dn, p.dt), self.controls, 1 / self.measurements)
+        return StateSpace(A, B, C, Dn, p.dt).multiplied(self.controls, 1 / self.measurements)
 
 
 def _blocks(rows: list[list[AnyArray]]) -> AnyArray:

@@ -40,7 +40,6 @@ A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -104,7 +103,6 @@ class ObserverProblem:
     remainder_left: StateSpace | None = None  # (n, n), left weight of the additive remainder on scaled states
     remainder_right: StateSpace | None = None  # (m, m), right weight of it on scaled inputs
     injection: Injection = Injection.STATE  # where the correction enters
-    process_noise: AnyArray | None = None  # (n,), standard deviation of white noise on every state per sample
     form: Form = Form.INVERSE_INPUT_MULTIPLICATIVE  # of the uncertainty, or its name
 
     def __post_init__(self) -> None:
@@ -116,14 +114,10 @@ class ObserverProblem:
         n, m, q, kept = self.nominal.n_states, self.nominal.n_inputs, len(self.C), self.n_original
         self._require(self.C.shape[1] == n, f"C should be (q, {n}) for {n} lifted states, found {self.C.shape}")
         self._require(kept is None or 1 <= kept <= n, f"n_original = {kept} should lie between 1 and {n}")
-        if self.process_noise is None:
-            put("process_noise", np.zeros(n))
-        positive = ("input_scale", m, TINY), ("output_scale", n, TINY), ("noise", q, TINY)
-        for name, size, least in (*positive, ("process_noise", n, 0.0)):
+        for name, size in (("input_scale", m), ("output_scale", n), ("noise", q)):
             value = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value >= least)))
-            wanted = f"{size} {'positive numbers' if least else 'numbers of at least zero'}"
-            self._require(valid, f"{name} should be {wanted}, found {value}")
+            valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value >= TINY)))
+            self._require(valid, f"{name} should be {size} positive numbers, found {value}")
             put(name, value)
         one = (self.remainder_left is None) != (self.remainder_right is None)
         self._require(self.injection is not Injection.NONE, "injection should be INPUT or STATE, found NONE")
@@ -271,50 +265,42 @@ class ObserverProblem:
             )
         return size
 
-    @property
-    def scaled_process_noise(self) -> AnyArray:
-        """Standard deviation of the process noise over `output_scale`, shape (n,)."""
-        return self.process_noise / self.output_scale
-
     def error_plant(self) -> GeneralizedPlant:
         """Unweighted error system, scaled.
 
-        W = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise.
+        w = (d, r, n), z = W_p e, y = C e + n; d acts at the input, r at the state.
         """
         A, B, C, W_p = self.scaled
         n, m, q, J = len(A), B.shape[1], len(C), self.injection_matrix
-        B1 = np.hstack([B, np.zeros((n, n + q)), np.diag(self.scaled_process_noise)])
-        D11 = np.hstack([np.zeros((len(W_p), m)), W_p, np.zeros((len(W_p), q + n))])
-        D21 = np.hstack([np.zeros((q, m)), C, np.eye(q), np.zeros((q, n))])
+        B1 = np.hstack([B, np.zeros((n, n + q))])
+        D11 = np.pad(W_p, ((0, 0), (m, q)))
+        D21 = np.hstack([np.zeros((q, m)), C, np.eye(q)])
         D12, D22 = (np.zeros((rows, J.shape[1])) for rows in (len(W_p), q))
         return GeneralizedPlant(A, B1, -J, W_p, C, D11, D12, D21, D22, self.nominal.dt)
 
     def error_system(self, controller: StateSpace) -> StateSpace:
-        """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
+        """Closed error system from (d, r, n), scaled, to W_p e, for a controller in physical units."""
         return self.error_plant().close(self.to_scaled(controller))
 
     def estimate_error(self, estimate: StateSpace) -> StateSpace:
-        """Error system from (d, r, n, v, s), scaled, to W_p e, for an estimate that nothing is fed back to.
+        """Error system from (d, r, n, s), scaled, to W_p e, for an estimate that nothing is fed back to.
 
-        ``e = x - F [C x + n; x; s]``, ``x = G (s + d) + r + (zI - A)^-1 v``; F from measurements, states (for functions
-        of what is measured) and inputs to all states, in physical units.
+        ``e = x - F [C x + n; x; s]``, ``x = G (s + d) + r``; F from measurements, states (for functions of what is
+        measured) and inputs to all states, in physical units.
         """
         A, B, C, W_p = self.scaled
-        n, m, q, eye, dt = len(A), B.shape[1], len(C), np.eye, self.nominal.dt
+        n, m, q, eye = len(A), B.shape[1], len(C), np.eye
         truth = np.vstack([C, eye(n), np.zeros((m, n))])
         columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
-        plant = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt)
-        wires = {
-            "plant": {"d": B, "s": B, "v": np.diag(self.scaled_process_noise)},
-            "F": {"plant": truth, "r": truth} | columns,
-        }
-        inputs, outputs = {"d": m, "r": n, "n": q, "v": n, "s": m}, {"z": {"plant": W_p, "r": W_p, "F": -W_p}}
-        return interconnect({"plant": plant, "F": self.scaled_estimate(estimate)}, wires, inputs, outputs)
+        wires = {"plant": {"d": eye(m), "s": eye(m)}, "F": {"plant": truth, "r": truth} | columns}
+        inputs, outputs = {"d": m, "r": n, "n": q, "s": m}, {"z": {"plant": W_p, "r": W_p, "F": -W_p}}
+        blocks = {"plant": self.scaled_model, "F": self.scaled_estimate(estimate)}
+        return interconnect(blocks, wires, inputs, outputs)
 
     def scaled_estimate(self, estimate: StateSpace) -> StateSpace:
         """Turn an estimate of all states from measurements, states and inputs into scaled coordinates."""
         sizes = np.concatenate([self.noise, self.output_scale, self.input_scale])
-        return multiplied(estimate, 1 / self.output_scale, sizes)
+        return estimate.multiplied(1 / self.output_scale, sizes)
 
     @property
     def _scales(self) -> tuple[AnyArray, AnyArray]:
@@ -324,14 +310,9 @@ class ObserverProblem:
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
         correction, noise = self._scales
-        return multiplied(controller, 1 / correction, noise)
+        return controller.multiplied(1 / correction, noise)
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
         correction, noise = self._scales
-        return multiplied(controller, correction, 1 / noise)
-
-
-def multiplied(system: StateSpace, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
-    """Return a system with outputs and inputs multiplied."""
-    return replace(system, B=system.B * inputs, C=outputs[:, None] * system.C, D=outputs[:, None] * system.D * inputs)
+        return controller.multiplied(correction, 1 / noise)

@@ -4,16 +4,15 @@ For every form, with the perturbed plant in it (`observer_problem`) and the obse
 
     w1 -> W_u -+-> s                       s, or x = G (s + [W_L w2]) + [W_L w2] -> W_R -> z2 ... Delta ... w2
                |                                   (what an inverse form sees contains W_L w2)
-               +-> W_rR -> z3 ... Delta_r ... w3
 
-    at the input:  xi+ = A xi + B W_L w2 + v - J u,    e = xi + W_rL w3
-    at the state:  xi+ = A xi + v - J u,               e = xi + W_L w2 + W_rL w3        z1 = W_p e
-                                                                                        y  = C e + n,   u = K y
+    at the input:  xi+ = A xi + B W_L w2 - J u,    e = xi
+    at the state:  xi+ = A xi - J u,               e = xi + W_L w2        z1 = W_p e
+                                                                          y  = C e + n,   u = K y
 
 *Why this is minimal.* With ``x = G s + ...`` the state of the perturbed plant and ``x_hat+ = A x_hat + B s + J u`` the
-observer, both are driven
-by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one drops out, and the other
-one remains only where the perturbation sees the state, through ``x``. Likewise W_u remains for what Delta sees alone.
+observer, both are driven by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one
+drops out, and the other one remains only where the perturbation sees the state, through ``x``. Likewise W_u remains for
+what Delta sees alone.
 The interconnection has every block once, so with minimal weights the whole is minimal but for poles that cancel between
 blocks.
 
@@ -37,13 +36,13 @@ _LEAST_NOISE, _PENALTY = 1e-3, 3e-2
 
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
-    """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); brackets for remainder and process noise."""
+    """Whole problem: w = (w1, w2, n), z = (z1, z2), without the remainder."""
     location, plant, eye = problem.form, problem.error_plant(), np.eye
     error, (n, _, n_u, n_z, q), m = plant.open_loop(), plant.sizes, problem.nominal.n_inputs
-    d, r, noise, v, u = np.split(eye(error.n_inputs), np.cumsum([m, n, q, n]), axis=1)
+    d, r, noise, u = np.split(eye(error.n_inputs), np.cumsum([m, n, q]), axis=1)
     z, y = np.split(eye(error.n_outputs), [n_z])
     blocks = {"error": error, "W_u": problem.input_weight, "W_L": problem.W_L, "W_R": problem.W_R}
-    inputs, acts = {"w1": m, "w2": problem.W_L.n_inputs}, {"W_L": eye(problem.W_L.n_outputs)}
+    inputs, acts = {"w1": m, "w2": problem.W_L.n_inputs, "n": q}, {"W_L": eye(problem.W_L.n_outputs)}
     wires: dict[str, dict[str, AnyArray]] = {"W_u": {"w1": eye(m)}, "W_L": {"w2": eye(inputs["w2"])}}
     if not location.sees_input:
         blocks["plant"] = problem.scaled_model
@@ -52,17 +51,8 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     wires["W_R"] = seen | (acts if location.inverse and location.at_input is location.sees_input else {})
     wires["error"] = {"W_L": d if location.at_input else r, "n": noise, "u": u}
     outputs = {"z1": {"error": z}, "z2": {"W_R": eye(problem.W_R.n_outputs)}}
-    if problem.remainder_left is not None and problem.remainder_right is not None:
-        blocks |= {"W_rL": problem.remainder_left, "W_rR": problem.remainder_right}
-        inputs["w3"] = problem.remainder_left.n_inputs
-        wires |= {"W_rL": {"w3": eye(inputs["w3"])}, "W_rR": {"W_u": eye(m)}}
-        outputs["z3"] = {"W_rR": eye(problem.remainder_right.n_outputs)}
-        wires["error"]["W_rL"] = r
-    inputs["n"] = q
-    if problem.scaled_process_noise.any():
-        inputs["v"], wires["error"]["v"] = n, v
     system = interconnect(blocks, wires, inputs | {"u": n_u}, outputs | {"y": {"error": y}})
-    return split(system, sum(inputs.values()), system.n_outputs - q, n_w1=m, n_z1=n_z)
+    return split(system, sum(inputs.values()), system.n_outputs - q)
 
 
 def disturbed(problem: ObserverProblem, d: StateSpace, remainder: StateSpace | None) -> tuple[StateSpace, StateSpace]:
@@ -75,10 +65,10 @@ def disturbed(problem: ObserverProblem, d: StateSpace, remainder: StateSpace | N
 
 
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
-    """White noise (nu_d, nu_r, n, v) through shaping filters at the input and at the state."""
+    """White noise (nu_d, nu_r, n) through shaping filters at the input and at the state."""
     plant = problem.error_plant()
     _, _, n_u, n_z, n_y = plant.sizes
-    rest = gain(np.eye(n_y + problem.nominal.n_states + n_u), plant.dt)  # n, v, u
+    rest = gain(np.eye(n_y + n_u), plant.dt)  # n, u
     return split(plant.open_loop() @ block_diagonal([d, r, rest]), d.n_inputs + r.n_inputs + rest.n_inputs - n_u, n_z)
 
 
@@ -88,8 +78,7 @@ def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
     Matrix inequalities do not resolve an encoder's noise of 1e-7 of the range, which has a floor here, nor a problem
     without a penalty. A result is certified for the true noise.
     """
-    whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None, process_noise=None))
-    whole = penalise(whole, _PENALTY)
+    whole = penalise(generalized_plant(problem), _PENALTY)
     noise = np.maximum(1.0, _LEAST_NOISE * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
     w1, w2, n = np.split(np.arange(whole.sizes[1]), np.cumsum([len(problem.input_scale), problem.W_L.n_inputs]))
     z1, z2, penalty = np.split(np.arange(whole.sizes[3]), np.cumsum([len(problem.scaled[3]), problem.W_R.n_outputs]))

@@ -73,7 +73,7 @@ class Basis:
         shift = np.eye(self.delays, k=-1)
         poles = np.array(self.poles)
         b = np.concatenate([np.eye(self.delays, 1)[:, 0], np.sqrt(1 - poles**2)])
-        return block_diag(shift, np.diag(poles))[-self.size :, -self.size :], b
+        return block_diag(shift, np.diag(poles)), b
 
     @property
     def size(self) -> int:
@@ -106,14 +106,13 @@ def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
     largest = float(np.max(np.diag(R), initial=0.0))
     if not (np.isfinite(R).all() and largest > 0):
         raise SynthesisError("Shaping filter: the residual is zero or not finite; correct nothing (open loop).")
-    R = R + _FLOOR * largest * np.eye(n)
+    floor = _FLOOR * largest * np.eye(n)
+    R, spectrum = R + floor, spectrum + floor
     response = basis.response(np.exp(1j * np.linspace(0, np.pi, f)))
     k = basis.size
     blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
-    floor = np.einsum("f,fa,fb->ab", weight, response, response.conj()).real
-    G = blocks.reshape(k * n, k * n) + _FLOOR * largest * np.kron(floor, np.eye(n))
+    G = blocks.reshape(k * n, k * n)
     cross = np.einsum("f,fb,fij->ibj", weight, response.conj(), spectrum, optimize=True).real.reshape(n, k * n)
-    cross = cross + _FLOOR * largest * np.kron(weight @ response.conj().real, np.eye(n))
     Theta = np.linalg.solve(G, cross.T).T if k else cross
     innovation = R - Theta @ cross.T
     values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)
@@ -184,15 +183,9 @@ class ResidualProblem:
         return ~measured | measured.all()
 
     def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
-        """Root mean square of every state's scaled error, (n,), infinite where the error dynamics are unstable."""
+        """Root mean square of every state's scaled error, (n,)."""
         loop = self.loop(shaping, K)
-        if not loop.is_stable():
-            return np.full(loop.n_outputs, np.inf)
         return np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, loop.dt) @ loop.C.T), TINY))
-
-    def norm(self, shaping: StateSpace, K: StateSpace) -> float:
-        """Root mean square of the scaled error."""
-        return h2_norm(self.loop(shaping, K))
 
     def unit_errors(self, K: StateSpace) -> Array:
         """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
@@ -235,18 +228,14 @@ def residual_h2(
     """Return the correction that is optimal for residuals; reducing its order costs each hidden state the tolerance."""
     start = time.perf_counter()
     full = problem.filter()
-    K = problem.correction(full)
-    if not np.isfinite(problem.norm(full, K)):
-        raise SynthesisError(
-            "Residual-shaped observer: its error is not bounded; check the model and what is measured."
-        )
-    K = problem.reduced(full, K, tolerance_percent, full.n_states if max_order is None else max_order)
-    norm = problem.norm(full, K)
+    most = full.n_states if max_order is None else max_order
+    K = problem.reduced(full, problem.correction(full), tolerance_percent, most)
+    norm = h2_norm(problem.loop(full, K))
     note = f"mean of {len(problem.spectra)} units, {problem.basis.delays} delays, lags {problem.basis.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
     lower, gap, notes = enclosed(norm, problem.lower_bound(full))
     n = len(problem.A)
-    to_lifted = np.vstack([np.diag(problem.scale), np.zeros(((n_lifted or n) - n, n))])
+    to_lifted = np.eye(n_lifted or n, n) * problem.scale
     return Synthesis(
         method="residual_h2",
         controller=gain(to_lifted, problem.dt) @ K,

@@ -23,11 +23,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.linalg import LinAlgError, cond, eigh, eigvals, eigvalsh, norm, svd
+from numpy.linalg import LinAlgError, cond, eigh, eigvalsh, norm, svd
 from scipy.linalg import schur
 
 from ...core import EPS, SINGULAR, TINY, AnyArray, StateSpace, SynthesisError, frozen
-from ...core.linalg import balanced_size
+from ...core.linalg import balanced_size, spectral_radius
 from ...core.norms import to_continuous
 from ..generalized_plant import GeneralizedPlant, split
 from .h2 import absorb_feedthrough, balancing, riccati_pair
@@ -76,7 +76,7 @@ class Frame:
         try:
             X, F = _half(p.A, p.B1, p.B2, p.C1, p.D11, p.D12, gamma)
             Y, L = _half(p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T, gamma)
-            radius = float(np.abs(eigvals(Y @ X)).max(initial=0.0)) / gamma**2
+            radius = float(spectral_radius(Y @ X)) / gamma**2
             if min(_lowest(X, _size(p.A, p.C1)), _lowest(Y, _size(p.A, p.B1))) < -_DOUBT or radius > 1 + _DOUBT:
                 return None, True
             return (self._given(_central(p, gamma, X, F, Y, L.T)), False) if radius < 1 else (None, False)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.linalg import norm, svd
 
 from ...core import AGREED, EPS, TINY, AnyArray, frozen
-from ...core.linalg import adjoint
+from ...core.linalg import adjoint, energy
 from ..problem.observer_problem import ObserverProblem
 
 _SMALL = float(np.sqrt(TINY))  # what is divided by it and squared stays finite
@@ -56,8 +56,8 @@ class Ball:
 
     def average(self) -> AnyArray:
         """Average spectrum, shape (f, b, b)."""
-        energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / max(self.right.shape[-2], self.left.shape[-1])
-        return self.center @ adjoint(self.center) + energy[..., None, None] * (self.left @ adjoint(self.left))
+        share = energy(self.right) / max(self.right.shape[-2], self.left.shape[-1])
+        return self.center @ adjoint(self.center) + share[..., None, None] * (self.left @ adjoint(self.left))
 
     def worst(self, T: AnyArray, certain: AnyArray | float = 0.0, iterations: int = 15) -> AnyArray:
         """Contraction of an element that is (locally) worst for ``certain + T X M``, shape (f, b, a)."""
@@ -119,7 +119,7 @@ def dual_bound(a: AnyArray, P: AnyArray, Q: AnyArray) -> AnyArray:
     g = g + rounding * (g + d.max(axis=-1, initial=0.0))  # else the slack of a tiny centre is rounded to zero
     slack = g[..., :, None] + multipliers[..., None, :] - d
     rest = np.where(c > 0, c / np.maximum(slack, _SMALL), 0.0).sum(axis=(-2, -1))
-    squared = np.sum(np.abs(a) ** 2, axis=(-2, -1)) + g.sum(axis=-1) + multipliers.sum(axis=-1) + rest
+    squared = energy(a) + g.sum(axis=-1) + multipliers.sum(axis=-1) + rest
     return np.where(np.isfinite(squared), np.sqrt(squared), np.inf)
 
 

@@ -24,6 +24,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...core import ITERATED, ROUNDING, AnyArray, StateSpace, SynthesisError, h2_norm
+from ...core.linalg import energy
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from .ball import spread, uncertain_ball
@@ -34,7 +35,7 @@ _ACCURACY = 1e-5  # of the quadrature, relative; a hundred times as much for wha
 
 
 def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) -> AnyArray:
-    """Certified worst-case power density of ``W_p e``, shape (f,), for the error system from (d, r, n, v[, s])."""
+    """Certified worst-case power density of ``W_p e``, shape (f,), for the error system from (d, r, n[, s])."""
     response, T, certain, noise = _responses(problem, errors, freqs_hz)
     uncertain = uncertain_ball(problem, freqs_hz).bound(T, certain)
     if problem.remainder is not None:
@@ -48,7 +49,7 @@ def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Any
     _, T, certain, noise = _responses(problem, errors, freqs_hz)
     ball = uncertain_ball(problem, freqs_hz)
     response = certain + T @ (ball.center + ball.left @ ball.worst(T, certain) @ ball.right)
-    return np.sum(np.abs(response) ** 2, axis=(-2, -1)) + noise
+    return energy(response) + noise
 
 
 def _responses(
@@ -57,10 +58,10 @@ def _responses(
     """Return the response of an error system to r, T, ``T_s W_u``, and the density of noise."""
     m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response = errors.frequency_response(freqs_hz)
-    d, r, noise, s = np.split(response, [m, m + n, m + 2 * n + len(problem.C)], axis=-1)
+    d, r, noise, s = np.split(response, [m, m + n, m + n + len(problem.C)], axis=-1)
     T = (d if problem.form.at_input else r) @ problem.W_L.frequency_response(freqs_hz)
     certain = s @ problem.input_weight.frequency_response(freqs_hz) if s.size else 0.0
-    return r, T, certain, np.sum(np.abs(noise) ** 2, axis=(-2, -1))
+    return r, T, certain, energy(noise)
 
 
 def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, float]:
@@ -69,7 +70,7 @@ def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, fl
 
 
 def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> tuple[float, float]:
-    """Return what `certify` returns, for the error system from (d, r, n, v[, s]) and the mean of ``W_p e``."""
+    """Return what `certify` returns, for the error system from (d, r, n[, s]) and the mean of ``W_p e``."""
     squared, error = _mean_square(problem, errors, density, _ACCURACY)
     squared += float(np.sum(np.square(mean)))
     upper = float(np.sqrt(squared + error))

@@ -7,11 +7,11 @@ component of w2.
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 
-from ...core import AnyArray, StateSpace, block_diagonal, gain
+from ...core import AnyArray, StateSpace, block_diagonal
 from ...uncertainty import fit_magnitude
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import disturbed
@@ -30,8 +30,11 @@ def average_disturbance(problem: ObserverProblem, max_order: int, tolerance_db: 
         shaped = of(np.sum(left, axis=-1) * power)
     else:
         shaped = problem.W_L @ of(power)
-    rest = _remainder(problem, freqs)
-    return disturbed(problem, shaped, None if rest is None else of(rest))
+    if problem.remainder is None:
+        return disturbed(problem, shaped, None)
+    left, right = (np.abs(side.frequency_response(freqs)) ** 2 for side in problem.remainder)
+    energy = right.sum(axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
+    return disturbed(problem, shaped, of(left.sum(axis=-1) * energy[:, None]))
 
 
 def design_grid(problem: ObserverProblem) -> AnyArray:
@@ -42,32 +45,12 @@ def design_grid(problem: ObserverProblem) -> AnyArray:
     return np.geomspace(min(max(slowest / 30, 1e-7), 1e-2), np.pi, 400) / (2 * np.pi * dt)  # 400 points
 
 
-def _remainder(problem: ObserverProblem, freqs_hz: AnyArray) -> AnyArray | None:
-    """Average spectrum of the remainder, shape (f, n)."""
-    if problem.remainder is None:
-        return None
-    left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
-    energy = np.sum(np.abs(right) ** 2, axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
-    return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
-
-
 def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, max_order: int, tolerance_db: float) -> StateSpace:
     """Return one filter a channel, whose magnitude touches the root of its power, shape (f, channels), from above."""
-    systems = []
-    for column in power.T:
-        if column.max() <= _NOTHING:
-            systems.append(gain([[0.0]], dt))
-            continue
-        magnitude = np.sqrt(np.maximum(column, _FLOOR * column.max()))
-        shape = (magnitude / magnitude.max()).tobytes()
-        system = _fitted(freqs_hz.tobytes(), shape, dt, max_order, tolerance_db)
-        ratio = magnitude / np.abs(system.frequency_response(freqs_hz)[:, 0, 0])
-        systems.append(gain([[float(ratio.max())]], dt) @ system)
-    return block_diagonal(systems)
-
-
-@lru_cache(maxsize=100)
-def _fitted(freqs_hz: bytes, magnitude: bytes, dt: float, max_order: int, tolerance_db: float) -> StateSpace:
-    """Return the system of a fit; problems that differ in noise alone share it."""
-    values = np.frombuffer(freqs_hz), np.frombuffer(magnitude)
-    return fit_magnitude(*values, dt, max_order=max_order, tolerance_db=tolerance_db).system
+    largest = power.max(axis=0)
+    power = np.where(largest > _NOTHING, np.maximum(power, _FLOOR * largest), 0.0)
+    fits = [
+        fit_magnitude(freqs_hz, column, dt, max_order=max_order, tolerance_db=tolerance_db)
+        for column in np.sqrt(power).T
+    ]
+    return block_diagonal([fit.system for fit in fits])

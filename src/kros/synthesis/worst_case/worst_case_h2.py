@@ -55,7 +55,7 @@ def worst_case_h2(
     -------
     Synthesis
         ``worst_case_h2`` with ``quadrature_error`` included, ``lower_bound`` for all observers of either injection, and
-        their gap; ``h2_norm`` is the norm of the error under measurement and process noise alone (the nominal machine).
+        their gap; ``h2_norm`` is the norm of the error under measurement noise alone (the nominal machine).
 
     Raises
     ------

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import AnyArray, Flags, frozen
-from ...core.linalg import entries_first, sigma_max_first, squared
+from ...core.linalg import pieces, sigma_max, squared
 from ..forms import Form, evenly, residual
 from ..settings import OUTLIER
 
@@ -39,9 +39,8 @@ def distances(form: Form, responses: AnyArray, freqs_hz: AnyArray) -> Distances:
     """Return the distances of all units, shape (unit, frequency, p, m), in scaled coordinates."""
     nominals = _nominals(responses)
     itself = nominals[:, None] == np.arange(len(responses))
-    step = max(1, OUTLIER.at_once // (itself.size * max(responses.shape[2:]) ** 2))
-    parts = [responses[:, k : k + step] for k in range(0, responses.shape[1], step)]
-    sigma, left, right = zip(*(_scaled(form, part, nominals, itself) for part in parts), strict=True)
+    parts = pieces(responses.shape[1], OUTLIER.at_once // (itself.size * max(responses.shape[2:]) ** 2))
+    sigma, left, right = zip(*(_scaled(form, responses[:, part], nominals, itself) for part in parts), strict=True)
     level = _smooth(20 * np.log10(np.maximum(np.concatenate(sigma, axis=2), OUTLIER.least)), freqs_hz)
     level[itself] = np.nan
     median = np.nanmedian(level, axis=0)
@@ -57,13 +56,13 @@ def _scaled(form: Form, G: AnyArray, nominals: AnyArray, itself: AnyArray) -> tu
     equal = middle.max(axis=(1, 2)) == 0  # most pairs are
     middle[equal] = squares[:, equal].mean(axis=0)
     left, right = typical(middle)
-    return sigma_max_first(entries_first(E / left[:, :, None] / right[:, None, :])), left, right
+    return sigma_max(E / left[:, :, None] / right[:, None, :]), left, right
 
 
 def scaled_levels(form: Form, nominal: AnyArray, perturbed: AnyArray, found: Distances, freqs_hz: AnyArray) -> AnyArray:
     """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB."""
     E = residual(form, nominal, perturbed) / found.left[:, :, None] / found.right[:, None, :]
-    return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), OUTLIER.least)), freqs_hz)
+    return _smooth(20 * np.log10(np.maximum(sigma_max(E), OUTLIER.least)), freqs_hz)
 
 
 def typical(squares: AnyArray) -> tuple[AnyArray, AnyArray]:

@@ -131,8 +131,7 @@ class Recorded:
         factors = [combine(e.lifted).R for e in evidence]
         sizes = np.sqrt([self.usual / e.n_samples for e in evidence])
         fitted = self.models.fit(np.stack(factors) * sizes[:, None, None])
-        names = tuple(map(str, range(len(factors))))
-        return replace(self.models, unit_ids=names, A=fitted.A, B=fitted.B).responses(self.freqs_hz)
+        return replace(self.models, A=fitted.A, B=fitted.B).responses(self.freqs_hz)
 
     def halves(self) -> tuple[AnyArray, AnyArray] | None:
         """Return the responses of all units from every second episode, and from the others."""

@@ -56,10 +56,8 @@ def excesses(peaks: AnyArray, inliers: Flags) -> AnyArray:
 
 
 def margins(levels: AnyArray, inliers: Flags, rate: float) -> tuple[AnyArray, AnyArray]:
-    """Return every unit's excess over the inliers, itself left out, and how far that is beyond their bound."""
+    """Return every unit's excess over two inliers or more, itself left out, and how far that is beyond their bound."""
     known, count = levels[inliers], int(inliers.sum())
-    if count < 2:
-        return np.zeros(len(levels)), np.full(len(levels), -np.inf)
     value, bound = excesses(levels.max(axis=1), inliers), np.full(len(levels), np.inf)
     bound[~inliers] = factor(count, rate) * scale(known).mean()
     if count > 2:

@@ -28,6 +28,7 @@ from ..settings import FIT, PROOF
 from .proof import ProofMethod
 
 _STEP = np.cbrt(EPS)  # nepers, of differences
+NEPER_DB = 20 / np.log(10.0)
 
 
 @frozen
@@ -41,9 +42,9 @@ class Cover:
         """Return the cover at some frequencies."""
         return Cover(self.left[rows], self.right[rows])
 
-    def cost_db(self) -> AnyArray:
-        """Return mean log left plus mean log right, in dB, shape (frequency,)."""
-        return 20 * (np.log10(self.left).mean(axis=1) + np.log10(self.right).mean(axis=1))
+    def cost(self) -> AnyArray:
+        """Return mean log left plus mean log right, nepers, shape (frequency,)."""
+        return np.log(self.left).mean(axis=1) + np.log(self.right).mean(axis=1)
 
     def ratio(self, E: AnyArray) -> AnyArray:
         """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), of residuals at the same frequencies."""
@@ -60,7 +61,7 @@ class Weight:
     left_orders: tuple[int, ...]  # of every diagonal entry
     right_orders: tuple[int, ...]
     cover_max: float = np.nan  # largest `sigma_max(W_L^-1 E_k W_R^-1)` over units and the dense grid; at most one
-    overbound_db_max: float = np.nan  # dB: largest excess of `Cover.cost_db` over the optimal cover
+    overbound_db_max: float = np.nan  # dB: largest excess of `Cover.cost` over that of the optimal cover
     method: ProofMethod = ProofMethod.GRID  # how the bound between grid points is known, see `proof`
 
     def magnitudes(self, freqs_hz: ArrayLike) -> Cover:
@@ -115,8 +116,8 @@ class _Smooth:
         top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))
         M = M / top
         wide = p <= m
-        adjoint = np.conj(np.swapaxes(M, 0, 1))
-        power = multiply(M, adjoint) if wide else multiply(adjoint, M)
+        other = np.conj(np.swapaxes(M, 0, 1))
+        power = multiply(M, other) if wide else multiply(other, M)
         for _ in range(self.squarings):
             power = multiply(power, power)
         Y = multiply(power, M) if wide else multiply(M, power)

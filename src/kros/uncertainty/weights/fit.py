@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 
 from ...core import AnyArray, Flags, StateSpace, block_diagonal, frozen, gain
-from ...core.frequency import bilinear_squared, nyquist_hz
+from ...core.frequency import nyquist_hz
+from ...core.linalg import pieces
 from ..forms import Form, completion, evenly, residual
 from ..settings import FIT, PROOF, SET
-from .cover import Cover, Weight, optimal_cover
+from .cover import NEPER_DB, Cover, Weight, optimal_cover
 from .joint import JointProblem, fit_jointly, refit
 from .proof import Certificate, Descriptor, certify, invert, leaves_nothing, residual_system
+from .sections import bilinear_squared
 
 
 def fit_weight(
@@ -45,8 +47,8 @@ def fit_weight(
     lift = max(proof.bound, on_grid) * (1 + PROOF.rounding) or 1.0  # until the left weight touches from above
     left = replace(left, C=left.C * lift, D=left.D * lift)
     weight, some = replace(weight, left=left, method=proof.method), cover.left.min(axis=1) > 0
-    excess = weight.magnitudes(freqs_hz).at(some).cost_db() - cover.at(some).cost_db()
-    overbound = float(excess.max(initial=0.0))
+    excess = weight.magnitudes(freqs_hz).at(some).cost() - cover.at(some).cost()
+    overbound = NEPER_DB * float(excess.max(initial=0.0))
     return replace(weight, cover_max=on_grid / lift, overbound_db_max=overbound), cover
 
 
@@ -56,7 +58,8 @@ def checking_grid(freqs_hz: AnyArray, sample_period_s: float) -> AnyArray:
     between = (inside[:-1, None] * (inside[1:] / inside[:-1])[:, None] ** steps).ravel()
     dense = np.unique(np.concatenate([[0.0], between, freqs_hz, [nyquist_hz(sample_period_s)]]))
     tau = bilinear_squared(dense, sample_period_s)
-    inner = np.log10(tau[(tau > 0) & (tau < np.inf)]) if ((tau > 0) & (tau < np.inf)).any() else np.zeros(1)
+    inside = tau[(tau > 0) & (tau < np.inf)]
+    inner = np.log10(inside) if inside.size else np.zeros(1)
     low, high = inner.min() - PROOF.decades, inner.max() + PROOF.decades
     logs = np.logspace(low, high, 1 + int(PROOF.a_decade * (high - low)))
     return joined(dense, np.arctan(np.sqrt(logs)) / (np.pi * sample_period_s))
@@ -105,7 +108,7 @@ class _Fit:
         """Return the frequencies between those of the fit, Hz, at which the weight costs more than at them."""
         if not weight.left.D.any():
             return np.zeros(0)
-        cost = weight.magnitudes(self.freqs_hz).cost_db() - self.optimal.cost_db() - self.fitted.excess_db
+        cost = NEPER_DB * (weight.magnitudes(self.freqs_hz).cost() - self.optimal.cost()) - self.fitted.excess_db
         return self.freqs_hz[_peaks(10 ** ((np.nan_to_num(cost, posinf=0.0) - FIT.missed_db) / 20))]
 
     def again(self, missed_hz: AnyArray) -> Weight:
@@ -137,8 +140,8 @@ class _Fit:
         cover = best.at(known[np.searchsorted(self.freqs_hz[known], freqs_hz).clip(0, len(known) - 1)])
         leading = np.argsort(-cover.ratio(E), axis=0)[: FIT.units]
         some = np.flatnonzero(np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0)
-        cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
-        optimal = np.where(self._inside(freqs_hz), np.interp(freqs_hz, self.freqs_hz[known], cost), np.inf)
+        cost = np.interp(freqs_hz, self.freqs_hz[known], best.at(known).cost())
+        optimal = np.where(self._inside(freqs_hz), cost, np.inf)
         tau = bilinear_squared(freqs_hz, self.dt)
         return JointProblem.of(tau[some], optimal[some], E[leading[:, some], some]), cover.at(some)
 
@@ -181,9 +184,9 @@ class Residuals:
 
     def pieces(self, freqs_hz: AnyArray) -> Iterator[tuple[AnyArray, AnyArray]]:
         """Yield responses and residuals, a few units at a time: memory does not grow with their number."""
-        G, step = self.nominal.frequency_response(freqs_hz), max(1, SET.at_once // max(1, len(freqs_hz)))
-        for start in range(0, self.count, step):
-            Gp = self.units[start : start + step].frequency_response(freqs_hz)
+        G = self.nominal.frequency_response(freqs_hz)
+        for part in pieces(self.count, SET.at_once // max(1, len(freqs_hz))):
+            Gp = self.units[part].frequency_response(freqs_hz)
             yield Gp, completion(self.form, G, Gp)[1] if self.remainder else residual(self.form, G, Gp)
 
     def at(self, freqs_hz: AnyArray) -> AnyArray:

@@ -24,12 +24,11 @@ from itertools import islice
 import numpy as np
 
 from ...core import TINY, AnyArray, frozen
+from ...core.linalg import adjoint
 from ..settings import FIT
-from .cover import Cover
+from .cover import NEPER_DB, Cover
 from .magnitude import Bound, rising_bounds
 from .sections import Sections
-
-NEPER_DB = 20 / np.log(10.0)
 
 
 @frozen
@@ -60,15 +59,7 @@ class JointProblem:
         return float(inner.min(initial=0.0)) - decades, float(inner.max(initial=-decades)) + decades
 
 
-@frozen
-class JointFit:
-    """Sections that are sound for a problem, and the largest excess of their cost, dB."""
-
-    sections: Sections
-    excess_db: float
-
-
-def fit_jointly(problem: JointProblem, cover: Cover, max_order: int, tolerance_db: float) -> JointFit:
+def fit_jointly(problem: JointProblem, cover: Cover, max_order: int, tolerance_db: float) -> Bound:
     """Return diagonal magnitudes, left ones first, of the smallest order within the tolerance, or of the largest."""
     sides = np.hstack([cover.left, cover.right]).T
     entries = [(rising_bounds(problem.tau, values, max_order), list[Bound]()) for values in sides]
@@ -87,7 +78,7 @@ def _simplest(known: list[Bound], tolerance_db: float) -> Sections:
     return next(bound.sections for bound in known if bound.excess_db <= enough)
 
 
-def refit(problem: JointProblem, start: Sections) -> JointFit:
+def refit(problem: JointProblem, start: Sections) -> Bound:
     """Return the best sections of the same orders near a start, raised to be sound."""
     first = start.at(start.parameters, problem.ends)
     state = _State(problem, first, first.parameters)
@@ -173,19 +164,18 @@ class _State:
             damping *= 8
         return None
 
-    def fitted(self) -> JointFit:
-        """Return the sections, raised to be sound."""
+    def fitted(self) -> Bound:
+        """Return the sections, raised to be sound, and the largest excess of their cost."""
         excess, deficit = (float(terms.values.max()) for terms in self.terms[:2])
         lifted = self.sections.lifted(slice(0, self.problem.residuals.shape[1]), deficit)
-        return JointFit(lifted, (excess + deficit) * NEPER_DB)
+        return Bound(lifted, (excess + deficit) * NEPER_DB)
 
 
 def _singular(matrices: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return log singular values, (n, rank), and squared moduli of the entries of their vectors, left then right."""
-    adjoint = np.conj(np.swapaxes(matrices, 1, 2))
-    wide = matrices.shape[1] <= matrices.shape[2]
-    squares, short = np.linalg.eigh(matrices @ adjoint if wide else adjoint @ matrices)
-    long = np.abs((adjoint if wide else matrices) @ short) ** 2
+    other, wide = adjoint(matrices), matrices.shape[1] <= matrices.shape[2]
+    squares, short = np.linalg.eigh(matrices @ other if wide else other @ matrices)
+    long = np.abs((other if wide else matrices) @ short) ** 2
     long /= np.maximum(long.sum(axis=1, keepdims=True), TINY)
     parts = (np.abs(short) ** 2, long) if wide else (long, np.abs(short) ** 2)
     return np.log(np.maximum(squares, TINY)) / 2, np.swapaxes(np.concatenate(parts, axis=1), 1, 2)

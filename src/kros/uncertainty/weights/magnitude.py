@@ -28,7 +28,6 @@ W. Dinkelbach, "On nonlinear fractional programming", Management Science 13 (196
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -49,11 +48,9 @@ from ...core import (
     frozen,
     gain,
 )
-from ...core.frequency import bilinear_squared, check_grid
+from ...core.frequency import check_grid
 from ..settings import MAGNITUDE, WEIGHT
-from .sections import Sections
-
-_LOG = logging.getLogger(__name__)
+from .sections import Sections, bilinear_squared
 
 
 @frozen
@@ -142,9 +139,9 @@ def fit_magnitude(
 
 @frozen
 class Bound:
-    """Best bound of one order."""
+    """Magnitudes above data, and their largest excess."""
 
-    sections: Sections  # above the data
+    sections: Sections
     excess_db: float
 
 
@@ -161,8 +158,8 @@ def rising_bounds(tau: AnyArray, magnitude: AnyArray, max_order: int) -> Iterato
             try:
                 sections = best.factor().lifted(slice(0, 1), float(np.log(unit)))
                 bound = Bound(sections, 10 * float(np.log10(ratio)))
-            except KrosError as error:
-                _LOG.debug("Magnitude fit: %s", error)
+            except KrosError:  # roots that do not settle, or too near the unit circle
+                pass
         if bound is not None:
             yield bound
         if ratio < MAGNITUDE.exact:
@@ -185,8 +182,7 @@ def _best(tau: AnyArray, targets: AnyArray, order: int, gamma: float) -> Rationa
         best = _Grid.of(tau, targets, knots, cuts).best(gamma)
         try:
             zeros = best.not_positive() if best is not None else []
-        except KrosError as error:  # multiple roots
-            _LOG.debug("Magnitude fit: %s", error)
+        except KrosError:  # multiple roots
             return None
         if not zeros:
             return best
@@ -290,18 +286,13 @@ class RationalMagnitude:
         return sorted(r.real for r in chain(*self.sides) if r.real >= 0 and abs(r.imag) <= _ROUNDING * abs(r))
 
     def factor(self) -> Sections:
-        """Return the stable, minimum-phase system whose squared magnitude this is, or raise a `KrosError`."""
-        bad = self.not_positive()
-        ends = self.numerator[[0, -1]] / self.denominator[[0, -1]]
-        if bad or not (np.isfinite(ends).all() and (ends > 0).all()):
-            problem = f"is {ends} at DC and Nyquist, and zero or infinite at tau = {bad}"
-            raise KrosError(f"Spectral factor: the squared magnitude {problem}; try another order.")
+        """Return the stable, minimum-phase system of a positive squared magnitude, or raise a `KrosError`."""
         zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in self.sides)
         distance = np.array([1 - abs((1 + w) / (1 - w)) for w in (*zeros, *poles)])
         if not (distance > _ROUNDING / 10).all():
             problem = f"a pole or zero is {distance.min():.1e} from the unit circle, too near for double precision"
             raise KrosError(f"Spectral factor: {problem}; try another order.")
-        return Sections.of_roots(float(np.log(ends[0]) / 2), zeros, poles)
+        return Sections.of_roots(float(np.log(self.numerator[0] / self.denominator[0]) / 2), zeros, poles)
 
 
 def basis(tau: AnyArray, knots: AnyArray) -> AnyArray:

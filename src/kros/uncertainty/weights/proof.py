@@ -19,22 +19,19 @@ Systems & Control Letters 14 (1990) 287-293.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from ...core import AnyArray, StateSpace, frozen
 from ...core.frequency import nyquist_hz
-from ...core.norms import to_continuous
+from ...core.norms import sharpened, to_continuous
 from ..forms import Form, change_of, loop_of, residual_of
 from ..settings import PROOF
 
 Ratio = Callable[[AnyArray], AnyArray]
-
-_LOG = logging.getLogger(__name__)
 
 
 class ProofMethod(str, Enum):
@@ -60,10 +57,9 @@ class Certificate:
 
 def certify(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray, pencils: list[Descriptor], dt: float) -> Certificate:
     """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, by level sets if possible."""
-    freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))
-    if not pencils or peak <= 0 or not _trusted(pencils, freqs_hz, known, dt):
-        return Certificate(ProofMethod.GRID, peak, freq)
-    for _ in range(PROOF.levels):
+    freq, peak = sharpened(ratio, freqs_hz, known.max(axis=0))
+    provable = pencils and peak > 0 and _trusted(pencils, freqs_hz, known, dt)
+    for _ in range(PROOF.levels if provable else 0):
         points = np.unique(np.concatenate([_candidates(p, peak * (1 + PROOF.margin), dt) for p in pencils]))
         values = ratio(points).max(axis=0)
         top = int(values.argmax())
@@ -71,16 +67,6 @@ def certify(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray, pencils: list[Des
             return Certificate(ProofMethod.LEVEL_SETS, peak, freq)
         peak, freq = float(values[top]), float(points[top])
     return Certificate(ProofMethod.GRID, peak, freq)
-
-
-def _sharpened(ratio: Ratio, freqs_hz: AnyArray, known: AnyArray) -> tuple[float, float]:
-    """Return frequency and height of the highest peak, searched for between its neighbours."""
-    from scipy.optimize import minimize_scalar
-
-    top = int(known.argmax())
-    ends = freqs_hz[max(top - 1, 0)], freqs_hz[min(top + 1, len(freqs_hz) - 1)]
-    best = minimize_scalar(lambda f: -ratio(np.array([f])).max(), bounds=ends, method="bounded")
-    return max((float(freqs_hz[top]), float(known[top])), (float(best.x), -float(best.fun)), key=lambda peak: peak[1])
 
 
 def _crossings_hz(pencil: Descriptor, gamma: float, dt: float) -> AnyArray:
@@ -106,8 +92,6 @@ def _trusted(pencils: list[Descriptor], freqs_hz: AnyArray, known: AnyArray, dt:
     at = _crossings_hz(pencils[unit], level, dt)
     low, high = freqs_hz[crossing] * (1 - PROOF.near), freqs_hz[crossing + 1] * (1 + PROOF.near)
     seen = np.searchsorted(at, high, side="right") > np.searchsorted(at, low)
-    if not seen.all():
-        _LOG.debug("Certificate: %d of %d crossings have no eigenvalue; the grid decides", (~seen).sum(), len(seen))
     return bool(seen.all())
 
 
@@ -126,12 +110,6 @@ class Descriptor:
         """Return a discrete system."""
         mapped = to_continuous(system)
         return cls(np.eye(mapped.n_states), mapped.A, mapped.B, mapped.C, mapped.D)
-
-    @classmethod
-    def identity(cls, size: int) -> Descriptor:
-        """Return ones."""
-        none = np.zeros((0, 0))
-        return cls(none, none, np.zeros((0, size)), np.zeros((size, 0)), np.eye(size))
 
     def __matmul__(self, first: Descriptor) -> Descriptor:
         """Return the series connection, the other one first."""
@@ -213,9 +191,7 @@ def _eigenvalues(left: AnyArray, right: AnyArray) -> AnyArray:
 
 def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
     """Tell whether a form rebuilds every regular unit of a shape exactly."""
-    if form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
-        return form is Form.ADDITIVE or n_outputs == n_inputs
-    return n_outputs <= n_inputs if form.at_input else n_outputs >= n_inputs
+    return (not form.at_input or n_outputs <= n_inputs) and (form.sees_input or n_outputs >= n_inputs)
 
 
 def residual_system(form: Form, G: Descriptor, Gp: Descriptor, remainder: bool) -> Descriptor:
@@ -226,7 +202,7 @@ def residual_system(form: Form, G: Descriptor, Gp: Descriptor, remainder: bool) 
     if not form.inverse:
         return (Gp - G) - change_of(form, G, E)
     loop = loop_of(form, G, E)
-    inverse = (Descriptor.identity(len(loop.D)) - loop).inverse()
+    inverse = replace(loop, C=-loop.C, D=np.eye(len(loop.D)) - loop.D).inverse()
     return Gp - (G @ inverse if form.at_input else inverse @ G)
 
 

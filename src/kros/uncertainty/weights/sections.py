@@ -18,10 +18,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core import AnyArray, StateSpace, frozen, gain
+from ...core import ROUNDING, AnyArray, Array, ArrayLike, StateSpace, frozen, gain
 from ..settings import MAGNITUDE
 
 _FLOAT = np.finfo(float)
+
+
+def bilinear_squared(freqs_hz: ArrayLike, sample_period_s: float) -> Array:
+    """Return tau = tan^2(theta / 2); infinity at Nyquist, and full relative precision near DC."""
+    freqs = np.asarray(freqs_hz, dtype=float)
+    half = np.pi * freqs * sample_period_s
+    at_top = np.abs(freqs * sample_period_s - 0.5) <= ROUNDING
+    return np.where(at_top, np.inf, np.tan(np.where(at_top, 0.0, half)) ** 2)
 
 
 @frozen

@@ -247,7 +247,7 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
         for (whole v = 0; v < w; v++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
             const vec seen = y[row], count = gap[recorded * MOST + row], held = from_inputs[i] + offset[i];
-            const vec reach = (1.0 - level(gap[i], bank[i])) * s->reach[s->measured[j]];
+            const vec reach = (vec){0} + s->reach[s->measured[j]];
             const vec apart = reg[i] - held, near = either(apart < -reach, -reach, either(apart > reach, reach, apart));
             const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});

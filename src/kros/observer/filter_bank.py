@@ -22,7 +22,7 @@ After a start, what happened before is not known; after a loss, filters hold wha
 forgets, and T = 1. Limits of the estimates hold before the fallback enters them, so that little of what is far away
 is left in long gaps.
 
-A missing measurement is replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback, and o of
+A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of
 states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so
 are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit
 ramp was run along, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g samples.
@@ -97,7 +97,7 @@ class Gaps:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
         level, recorded, offset = self.bank.level(self.age), x[:, : self.recorded], x[:, self.offset]
         if missing.any() or self.count.any():
-            reach = (1 - level[:, self.measured]) * self.bank.reach[self.measured]
+            reach = self.bank.reach[self.measured]
             held = (x[:, self.from_inputs] + offset)[:, self.measured]
             expected = held + np.clip(x[:, self.measured] - held, -reach, reach)
             ends = ~missing & (self.count > 0)

@@ -82,14 +82,12 @@ def with_gaps(
 ) -> FilterBank:
     """Return a filter bank with the ages of gaps that minimise a trial's errors under simulated losses.
 
-    The trial does not know the recordings. Those of measured states do not change: their substitutes are near the
-    fallback always.
+    The trial does not know the recordings. Measured states have none: their substitutes are near the fallback always.
     """
     n = len(trial.recorded)
     hidden = [i for i in range(n) if i not in trial.measured]
     half, recovery = np.full(n, _NEVER), np.zeros(n)
     assert trial.bank is not None
-    bank = replace(bank, half=half, recovery=recovery)
     if hidden:
         states, y, inputs, own = training(trial, recordings, settings)
         lost = losses(np.random.default_rng(settings.seed), *y.shape[:2])
@@ -103,7 +101,7 @@ def with_gaps(
         errors = blended_errors(states, filtered, from_inputs, lost, F, hidden, T, mu)
         choice = errors.mean(axis=1).argmin(axis=0)
         half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
-    return bank
+    return replace(bank, half=half, recovery=recovery)
 
 
 def decay_of(observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]) -> Array:

@@ -1,15 +1,102 @@
-"""``metrics.json`` with what verdict and sections ask of it; any part but ``study`` may be absent."""
+"""``metrics.json`` with what verdict and sections ask of it; any part but ``study`` may be absent.
+
+Errors of observers are in tables by condition, observer and channel.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import field
 from functools import cached_property
-from typing import Any
+from operator import itemgetter
+from typing import Any, TypeVar
+
+import numpy as np
 
 from ..core import ByName, Names, frozen
+from ..data import OUTLIERS, natural_key
 from ..design.task import split_name
-from .error_tables import ErrorTable, error_tables
 from .names import observer_label, readable_unit
+
+T = TypeVar("T")
+K = TypeVar("K")
+Rows = Sequence[ByName]
+_CELL = ("condition", "observer", "channel")
+
+
+def grouped(rows: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """Return rows by their keys."""
+    groups = dict[K, list[T]]()
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+@frozen
+class ErrorCell:
+    """Error of an observer in a channel, percent of the largest value; None where an estimate diverged."""
+
+    means: Mapping[str, float] = field(default_factory=dict)  # over units, of what all have, by its key in the metrics
+    worst: float | None = None
+    worst_unit: str | None = None
+    worst_rms: float | None = None
+    interval: Sequence[float] = ()  # 95 % interval of the mean, by a bootstrap over units
+    diverged: int = 0  # units whose estimate diverged
+
+    @property
+    def mean(self) -> float | None:
+        """Mean error over units."""
+        return self.means.get("error_percent")
+
+    @property
+    def shown(self) -> float | str | None:
+        """Mean error as tables show it."""
+        return "diverged" if self.diverged else self.mean
+
+
+@frozen
+class ErrorTable:
+    """Errors of all observers in one condition."""
+
+    condition: str
+    cells: Mapping[str, Mapping[str, ErrorCell]]
+
+    def hidden(self, measured: Sequence[str], observer: str | None = None) -> list[str]:
+        """Return the channels that are not measured and that an observer estimates, or any does; else all of them."""
+        estimated = self.cells.values() if observer is None else [self.cells[observer]]
+        known = dict.fromkeys(c for channels in estimated for c in channels)
+        return [c for c in known if c not in measured] or list(known)
+
+    def mean(self, observer: str, channels: Sequence[str]) -> float:
+        """Return the geometric mean of an observer's mean errors; infinite where one is not known."""
+        values = [self.cells[observer].get(c, ErrorCell()).mean for c in channels]
+        if not values or None in values:
+            return float("inf")
+        return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), np.finfo(float).tiny)))))
+
+
+def tables_of(rows: Rows, identify_on: str, intervals: Rows = ()) -> list[ErrorTable]:
+    """Return rows of errors by condition, that of the models first, observer and channel."""
+    place, tables = itemgetter(*_CELL), dict[str, dict[str, dict[str, ErrorCell]]]()
+    known = {place(row): row["interval"] for row in intervals}
+    for (condition, name, channel), units in grouped(rows, place).items():
+        cell = _cell(units, known.get((condition, name, channel), ()))
+        tables.setdefault(condition, {}).setdefault(name, {})[channel] = cell
+    ordered = sorted(tables, key=lambda condition: (condition != identify_on, natural_key(condition)))
+    return [ErrorTable(condition, tables[condition]) for condition in ordered]
+
+
+def _cell(rows: Sequence[Any], interval: Sequence[float]) -> ErrorCell:
+    """Summarise the units of one observer and channel."""
+    lost = len({r["unit"] for r in rows if r["error_percent"] is None})
+    if lost:
+        return ErrorCell(diverged=lost)
+    worst = max(rows, key=itemgetter("error_percent"))
+    numbers = (key for key, value in rows[0].items() if not isinstance(value, str))
+    known = {key: values for key in numbers if None not in (values := [r.get(key) for r in rows])}
+    means = {key: float(np.mean(values)) for key, values in known.items()}
+    worst_rms = max(known.get("rms", ()), default=None)
+    return ErrorCell(means, float(worst["error_percent"]), worst["unit"], worst_rms, interval)
 
 
 @frozen
@@ -21,6 +108,11 @@ class Facts:
     def get(self, name: str, otherwise: Any = None) -> Any:
         """Return a part of the metrics, or what is given otherwise."""
         return self.metrics.get(name, otherwise)
+
+    @property
+    def set_aside(self) -> list[str]:
+        """Units that take no part in pooled results."""
+        return [row["unit"] for row in self.get("units", ()) if row.get("group") == OUTLIERS]
 
     @property
     def study(self) -> ByName:
@@ -59,8 +151,10 @@ class Facts:
 
     @cached_property
     def tables(self) -> list[ErrorTable]:
-        """Errors of all observers, a table a condition, that of the models first."""
-        return error_tables(self.metrics)
+        """Errors of all observers on the units that took part, a table a condition, that of the models first."""
+        rows = [r for r in self.get("evaluation", []) if r["role"] in ("nominal", "off_nominal")]
+        others = [r for r in rows if r["role"] == "off_nominal"] or rows
+        return tables_of(others, self.study["identify_on"], self.get("intervals", ()))
 
     @property
     def table(self) -> ErrorTable | None:

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 from ..core import ConfigError, Progress, write_bytes
 from .canvas import Figure
-from .figures import FIGURES, draw_all
+from .figures import FIGURES, draw
 from .run_folder import RunFolder
 from .theme import DRAWING, Tone, style
 
@@ -33,7 +33,8 @@ def write_figures(run: Path, out: Path, progress: Progress | None = None) -> lis
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
     names, progress, began = [], progress or Progress(), time.perf_counter()
     progress.start("figures", len(FIGURES))
-    for drawn in draw_all(RunFolder(run)):
+    for name in FIGURES:
+        drawn = draw(name, RunFolder(run))
         progress.advance()
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)

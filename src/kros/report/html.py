@@ -50,7 +50,7 @@ def page(run: RunFolder, metrics: ByName, mapped: Mapped = map) -> str:
         if drawn["reason"]:
             log.info("figure %s: left out, %s", drawn["name"], drawn["reason"])
         figures[drawn["name"]] = {**drawn, "svg": Markup(drawn["svg"])}
-    aside = sum(row.get("group") == "outliers" for row in facts.get("units", []))
+    aside = len(facts.set_aside)
     count = f"{facts.study['units']} units" + (f" and {aside} set aside" if aside else "")
     conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
     name, subtitle = run.study.get("name", run.folder.name), " · ".join([count, *conditions])

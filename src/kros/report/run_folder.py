@@ -6,6 +6,7 @@ Only files in the records of the run count. What a run does not have raises `Not
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import field
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
@@ -31,11 +32,16 @@ class Shown:
     """One held-out episode with the estimates of observers and the predictions of models."""
 
     key: EpisodeKey
-    time_s: AnyArray  # shape (n_samples,)
+    sample_period_s: float
     states: AnyArray  # shape (n_samples, n)
     inputs: AnyArray  # shape (n_samples, m)
-    observers: Mapping[str, AnyArray]  # mapping of str to ndarray, shape (n_samples, n)
-    models: Mapping[str, AnyArray]  # mapping of str to ndarray, shape (n_samples, n)
+    observers: Mapping[str, AnyArray] = field(default_factory=dict)  # by name, shape (n_samples, n)
+    models: Mapping[str, AnyArray] = field(default_factory=dict)  # by name, shape (n_samples, n)
+
+    @property
+    def time_s(self) -> AnyArray:
+        """Times of the samples, shape (n_samples,)."""
+        return np.arange(len(self.states)) * self.sample_period_s
 
 
 @frozen
@@ -166,17 +172,16 @@ class RunFolder:
     def shown(self) -> list[Shown]:
         """Episodes with estimates: nominal unit, worst off-nominal unit, and the nominal unit in other conditions."""
         content, arrays = self._evaluation
-        return [self._shown(arrays, f"shown{k}/", EpisodeKey(*row)) for k, row in enumerate(content["shown"])]
 
-    def _shown(self, arrays: Mapping[str, AnyArray], start: str, key: EpisodeKey) -> Shown:
-        """Return one episode from the arrays whose names begin with `start`."""
-        part = {name.removeprefix(start): values for name, values in arrays.items() if name.startswith(start)}
-        observers, models = (
-            {name.removeprefix(kind): v for name, v in part.items() if name.startswith(kind)}
-            for kind in ("observer/", "model/")
-        )
-        time_s = np.arange(len(part["states"])) * self.sample_period_s
-        return Shown(key, time_s, part["states"], part["inputs"], observers, linear_first(models))
+        def below(start: str) -> dict[str, AnyArray]:
+            return {n.removeprefix(start): values for n, values in arrays.items() if n.startswith(start)}
+
+        shown = []
+        for k, row in enumerate(content["shown"]):
+            signals = self.sample_period_s, arrays[f"shown{k}/states"], arrays[f"shown{k}/inputs"]
+            observers, models = below(f"shown{k}/observer/"), below(f"shown{k}/model/")
+            shown.append(Shown(EpisodeKey(*row), *signals, observers, linear_first(models)))
+        return shown
 
     def _record(self, name: str) -> Record:
         """Return the content of an artifact; nothing where the run does not have it."""

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from enum import Enum
+from operator import itemgetter
 
 from ..core import ByName, frozen
 from ..data import some
 from ..design.task import split_name
-from .error_tables import ErrorCell, ErrorTable, tables_of
-from .facts import Facts
+from .facts import ErrorCell, ErrorTable, Facts, grouped, tables_of
 from .names import condition_label, joined, label_of, number, observer_label, words
 
 Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the section with the details
@@ -244,10 +244,8 @@ def undecided(rows: Sequence[ByName]) -> list[ByName]:
 
 def units_text(rows: Sequence[ByName]) -> str:
     """Return units with their conditions, for a sentence."""
-    units = dict[str, list[str]]()
-    for row in rows:
-        units.setdefault(row["unit"], []).append(condition_label(row["condition"]))
-    named = {unit: ", ".join(filter(None, conditions)) for unit, conditions in units.items()}
+    units = grouped(rows, itemgetter("unit")).items()
+    named = {unit: ", ".join(filter(None, (condition_label(r["condition"]) for r in of))) for unit, of in units}
     return some([f"{unit} ({conditions})" if conditions else unit for unit, conditions in named.items()])
 
 

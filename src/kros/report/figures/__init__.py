@@ -3,7 +3,7 @@
 The function of a row takes a `RunFolder` and the options of the row; it returns the figure and more of its caption.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import field
 from importlib import import_module
 from typing import Any
@@ -55,13 +55,18 @@ class Drawn:
     reason: str = ""
 
 
+def drawing(place: str) -> Callable[..., Any]:
+    """Return the function at a place, its module and its name."""
+    module, _, function = place.partition(":")
+    return getattr(import_module(f".{module}", __name__), function)
+
+
 def draw(name: str, run: RunFolder) -> Drawn:
     """Draw one figure of a run; one that lacks an artifact comes with the reason instead."""
     row = FIGURES[name]
-    module, _, function = row.function.partition(":")
     with style():
         try:
-            figure, text = getattr(import_module(f".{module}", __name__), function)(run, **row.options)
+            figure, text = drawing(row.function)(run, **row.options)
             return Drawn(name, row.title, figure, f"{row.see} {text}".strip())
         except NotShownError as absent:
             return Drawn(name, row.title, reason=str(absent))
@@ -75,8 +80,3 @@ def run_figure(run: Any, name: str = "observers_in_time") -> Figure:
     if drawn.figure is None:
         raise ConfigError(f"Plot of a run: the figure {name!r} is left out, {drawn.reason}.")
     return drawn.figure
-
-
-def draw_all(run: RunFolder) -> Iterator[Drawn]:
-    """Draw all figures of a run, one at a time."""
-    return (draw(name, run) for name in FIGURES)

@@ -71,9 +71,8 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
             if alarm in residuals.unit_ids:
                 line = levels[residuals.unit_ids.index(str(alarm)), ..., i, j]
                 panel.plot(freqs, line, color=Tone.ALARM, label=f"unit {alarm}")
-            frequency_axis(panel, freqs, "")
-            order = f"order {residuals.entry_orders[i, j]}"
-            note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT)
+            frequency_axis(panel, freqs)
+            note(panel, f"order {residuals.entry_orders[i, j]}", (0, 0), (3, 3), color=Tone.SOFT)
         row[0].set_ylabel(f"to\n{short(names[0][i])}\n(dB)")
     set_titles(block[0], (f"{label},\nfrom {short(name)}" for name in names[1]))
-    label_below(block[-1])
+    label_below(block[-1], "frequency (Hz)")

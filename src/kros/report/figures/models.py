@@ -45,7 +45,7 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
         lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
         if nominal in models.unit_ids:
             panel.plot(freqs, lines[models.index(nominal)], color=Tone.INK, label=f"nominal, unit {nominal}")
-        frequency_axis(panel, freqs, "frequency (Hz)" if i == rows - 1 else "")
+        frequency_axis(panel, freqs)
         panel.locator_params(axis="y", nbins=4)
         panel.set_ylabel("" if j else short(models.lifting.names[i]))
     for j, panel in enumerate(axes[0]):

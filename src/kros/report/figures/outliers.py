@@ -6,11 +6,10 @@ import numpy as np
 
 from ...data import natural_key, some
 from ...uncertainty import OutlierModel
-from ..canvas import Axes, Captioned, Figure, grid, name_units, note, units_axis
+from ..canvas import Axes, Captioned, grid, name_units, note, units_axis
 from ..names import condition_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
-from ..unit_verdicts import Check
 
 
 def scores(run: RunFolder) -> Captioned:
@@ -53,21 +52,3 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         axes.axhline(model.threshold_db, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
         text = f"threshold, {number(model.threshold_db)} dB"
         note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")
-
-
-def check_figure(check: Check) -> Figure:
-    """Draw the scores of new units, or the levels of their innovations, beside the threshold, a column a condition."""
-    conditions = sorted({row["condition"] for row in check.rows}, key=natural_key)
-    figure, axes = grid(1, len(conditions), sharey=True)
-    for panel, condition in zip(axes[0], conditions, strict=True):
-        rows = [row for row in check.rows if row["condition"] == condition]
-        for place, row in enumerate(rows):
-            scored = row["score"] is not None
-            value, threshold = (row["score"], row["threshold"]) if scored else (row["level_db"], 0.0)
-            ends = np.array([value, threshold], dtype=float)  # none is NaN
-            panel.plot(place, ends[0], "o", color=Tone.ALARM if row["outlier"] else Tone.BLUE)
-            panel.plot([place - 0.4, place + 0.4], ends[[1, 1]], color=Tone.SOFT, ls="--")
-        panel.set_title(condition_label(condition))
-        units_axis(panel, [row["unit"] for row in rows])
-    axes[0, 0].set_ylabel("score and threshold (dB)")
-    return figure

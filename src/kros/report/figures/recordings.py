@@ -26,7 +26,7 @@ from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, HUES, Tone
 from .entries import short
-from .episodes import draw_line, hide_times, label_rows, references, steady_stretches
+from .episodes import draw_line, label_rows, references, steady_stretches
 
 _RECORDED, _REFERENCE = Look(Tone.INK), Look(Tone.GOLD, weight=3, opacity=0.5)
 
@@ -48,7 +48,6 @@ def signals(run: RunFolder) -> Captioned:
                 draw_line(column[i], episode.time_s, reference, _REFERENCE, "reference")
             draw_line(column[i], episode.time_s, episode.states[:, i], _RECORDED, "recorded")
         column[0].set_title(episode_title(episode.key))
-        hide_times(column[:-1])
     label_rows(axes[:, 0], channels)
     label_below(axes[-1], "time (s)")
     figure.align_ylabels(axes[:, 0])
@@ -93,9 +92,9 @@ def excitation_figure(population: Population, unit: str | None = None, condition
         for name, line, tone in zip(population.states, coherence[i], HUES, strict=False):
             right.plot(freqs[1:], line[1:], color=tone, label=words(name))
         right.set_ylim(0, 1.05)
-        frequency_axis(left, freqs, "")
+        frequency_axis(left, freqs)
+        frequency_axis(right, freqs)
     set_titles(axes[0], (f"PSD, {len(keys)} episodes of unit {keys[0].unit}", "coherence with states"))
-    label_below(axes[-1])
     legend(figure, axes[0, 1])
     return figure
 

@@ -19,9 +19,7 @@ from ..canvas import (
     decibel,
     frequency_axis,
     grid,
-    label_below,
     legend,
-    line_over_shade,
     lines_of_units,
     note,
     set_titles,
@@ -100,7 +98,6 @@ def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResidu
         ratio_panel(row[2], residuals)
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
     set_titles(axes[0], ("left weight", "right weight", "units relative to the weights"))
-    label_below(axes[-1])
     return figure
 
 
@@ -111,7 +108,6 @@ def uncertain_figure(model: UncertainModel) -> Figure:
     draw_forms(axes[0, 2], model)
     legend(figure, axes[0, 2], 3)
     set_titles(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"))
-    label_below(axes[0])
     return figure
 
 
@@ -136,9 +132,11 @@ def _side(axes: Axes, freqs_hz: AnyArray, magnitudes: AnyArray, cover: AnyArray,
     columns = range(magnitudes.shape[1])
     labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
     for i, tone in zip(columns, HUES, strict=False):
-        line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone)
+        shade, line = decibel(cover[:, i]), decibel(magnitudes[:, i])
+        axes.plot(freqs_hz, shade, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
+        axes.plot(freqs_hz, line, color=tone)
         note(axes, words(labels[i]), (0, 1), (4, -10 * i - 1), va="top", color=tone)
-    frequency_axis(axes, freqs_hz, "")
+    frequency_axis(axes, freqs_hz)
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
     axes.set_ylim(low, high + (high - low) * len(columns) / 4)
 
@@ -153,7 +151,7 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     axes.plot(freqs, levels[first], color=Tone.INK)
     note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK)
     axes.axhline(0, color=Tone.ALARM, lw=DRAWING.thin, ls="--")
-    frequency_axis(axes, freqs, "")
+    frequency_axis(axes, freqs)
 
 
 def weights_entrywise(run: RunFolder) -> Captioned:

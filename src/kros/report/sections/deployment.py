@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ...core import ByName
-from ..content import Column, Section, Table, build
+from ..content import Column, Row, Section, Table, build
 from ..facts import Facts
 from ..names import axis_label, joined, label_of, number, words
 
@@ -42,12 +42,16 @@ def deployment(facts: Facts) -> Section | None:
 
 def _needed(facts: Facts, entry: ByName) -> Table | None:
     """Return the errors of measurements that cost one percent in each estimate; None where no gain is known."""
-    rows = [(c, kind, of) for c, kinds in entry.get("sensor_gains", {}).items() for kind, of in kinds.items()]
-    columns = [Column("error", [f"{axis_label(c, facts.unit(c))}: {_ERRORS[kind]}" for c, kind, _ in rows])]
-    for state in (s for s in entry.get("estimates", ()) if s not in entry["measured"]):
-        sizes = [entry["largest"][c] / (100 * of[state]) if of[state] else None for c, _, of in rows]
-        columns.append(Column(words(state), sizes))
-    return build("Error of a measurement that costs 1 % of the largest value of an estimate", columns)
+    rows = list[Row]()
+    for channel, kinds in entry.get("sensor_gains", {}).items():
+        share = entry["largest"][channel] / 100
+        for kind, gains in kinds.items():
+            sizes = {state: share / gain for state, gain in gains.items() if gain}
+            rows.append({"error": f"{axis_label(channel, facts.unit(channel))}: {_ERRORS[kind]}", **sizes})
+    columns = [Column(words(state), state) for state in entry.get("estimates", ()) if state not in entry["measured"]]
+    return build(
+        "Error of a measurement that costs 1 % of the largest value of an estimate", [Column("error"), *columns], rows
+    )
 
 
 def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:

@@ -11,8 +11,7 @@ from pathlib import Path
 from ...core import ConfigError, Record, load_artifact, write_bytes
 from ...loops.compiler import COMPILERS
 from ...report.compare import comparison, lines, sections
-from ...report.content import Column, Section, build
-from ...report.error_tables import ErrorCell
+from ...report.content import Column, Row, Section, build
 from ...report.facts import Facts
 from ...report.html import filled
 from ..config import Stage
@@ -51,14 +50,12 @@ def ranking(facts: Facts) -> list[str]:
     table = facts.table
     if table is None:
         return []
-    hidden = table.hidden(facts.measured)
-    names = sorted(table.cells, key=lambda name: table.mean(name, hidden))
-    columns = [Column("", [f"{name}{'  <- deployed' if name == facts.deployed else ''}" for name in names])]
-    for channel in hidden:
-        cells = [table.cells[name].get(channel, ErrorCell()) for name in names]
-        columns.append(Column(channel, ["diverged" if cell.diverged else cell.mean for cell in cells]))
+    hidden, rows = table.hidden(facts.measured), list[Row]()
+    for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
+        means = {channel: cell.shown for channel, cell in table.cells[name].items()}
+        rows.append({"": f"{name}{'  <- deployed' if name == facts.deployed else ''}", **means})
     title = "observers by mean error on held-out episodes, percent of the largest value:"
-    return lines(Section("", title, tables=[build("", columns)]))[1:]
+    return lines(Section("", title, tables=[build("", [Column(name) for name in ("", *hidden)], rows)]))[1:]
 
 
 def list_run(run: Path) -> list[str]:

@@ -89,13 +89,15 @@ class Store:
         return content
 
     def verify(self, *stages: str) -> None:
-        """Make sure that what some finished stages, or all, wrote is as they left it."""
-        manifest = read_manifest(self.folder)
-        for stage in [stage for stage in stages or manifest if stage in manifest]:
-            artefact = manifest[stage]
-            for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
-                reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
-                raise DataError(f"Run: {self.path(name)}, which stage {stage} wrote, {reason}; run the study again.")
+        """Make sure that what some finished stages wrote is as they left it, by default all but the report."""
+        for stage, artefact in read_manifest(self.folder).items():
+            wanted = stage in stages if stages else stage != Stage.REPORT  # `kros report` writes it again
+            for name in artefact.files if wanted else ():
+                if not artefact.matches(self.folder, name):
+                    reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
+                    raise DataError(
+                        f"Run: {self.path(name)}, which stage {stage} wrote, {reason}; run the study again."
+                    )
 
     def stored(self, digest: str) -> Artefact | None:
         """Return an artefact that is in the store, whole."""

@@ -12,7 +12,6 @@ from ..engine.executors import open_executor
 from ..engine.store import open_finished
 
 REPORT = "report.html"
-_SHOWN = [stage for stage in Stage if stage is not Stage.REPORT]
 
 
 def run(context: Context) -> None:
@@ -28,7 +27,7 @@ def render_run(folder: Path, workers: int) -> Path:
     """Write the report of a finished run again; `workers` processes draw its figures."""
     from ...report.html import render
 
-    with open_finished(folder, *_SHOWN, alone=True) as (_, store), open_executor(workers) as executor:
+    with open_finished(folder, alone=True) as (_, store), open_executor(workers) as executor:
         return render(store.folder, store.metrics(), executor.map)
 
 
@@ -36,5 +35,5 @@ def write_figures(folder: Path, out: Path, progress: Progress | None = None) -> 
     """Write the figures of a finished run as PNG and PDF."""
     from ...report import files
 
-    with open_finished(folder, *_SHOWN):
+    with open_finished(folder):
         return files.write_figures(folder, out, progress)

@@ -216,9 +216,9 @@ def compare_figure(
     """Draw simulations from the first recorded states beside the recording, with their fit in percent."""
     key = shown_episode(models, unit, condition)
     names = [model] if model else sorted(models.edmd_kinds if condition else models.kinds, key=is_koopman)
-    held_out = HeldOut(models.population, (key,), models.parameters, shown=(0,))
+    held_out = HeldOut(models.population, (key,), models.parameters, shown=(key,))
     batch = held_out.read([key])
-    runs = [held_out.models(models.models(name, condition)).shown[0] for name in names]
+    runs = [held_out.models(models.models(name, condition)).shown[key] for name in names]
     lines = {model_label(name): (values, model_look(name)) for name, values in zip(names, runs, strict=True)}
     figure = _episode_figure(models.population, batch, lines)
     figure.axes[0].set_title(f"{episode_title(key)}\n")  # above the fits, which stand beside it

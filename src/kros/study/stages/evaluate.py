@@ -11,6 +11,7 @@ from typing import Any, get_args
 import numpy as np
 
 from ...core import AnyArray, Array, ByName, KrosError, Names, Record, save_artifact
+from ...data import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
@@ -31,12 +32,9 @@ def run(context: Context) -> None:
     known, models = context.identified.parameters, context.identified.models()
     units = {u: known[u] for u in facts.groups if u in models.unit_ids}
     keys = tuple(k for k in facts.test if k.unit in units)
-    episodes = HeldOut(population, keys, units, sensor=context.config.sensor)
+    episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(context))
     episodes = replace(episodes, shown=showcase(context, episodes))
-    home = [i for i, k in enumerate(keys) if k.condition == facts.identify_on]
-    at_home = replace(
-        episodes, keys=tuple(keys[i] for i in home), shown=tuple(home.index(i) for i in episodes.shown if i in home)
-    )
+    at_home = replace(episodes, keys=tuple(k for k in keys if k.condition == facts.identify_on))
     observers = load_observers(context)
     kinds = {name: context.identified.models(name) for name in context.identified.kinds}
     work = estimation(context, episodes)
@@ -44,12 +42,11 @@ def run(context: Context) -> None:
     results = outcomes(context, work)
     free_runs: dict[str, Outcome] = {name: results.pop(f"free run/{name}") for name in kinds}  # type: ignore[misc]
     estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
-    band = band_hz(context)
     content: Record = {
-        "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles, band)],
+        "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles)],
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
-        "band_hz": band,
-        "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in episodes.shown)],
+        "band_hz": episodes.band_hz,
+        "shown": [[k.unit, k.condition, k.episode] for k in episodes.shown],
         "baselines": {name: facts_of(name, outcome) for name, outcome in results.items() if name not in observers},
         **episodes.recorded_rows(roles),
     }
@@ -125,7 +122,7 @@ def unit_roles(context: Context) -> dict[str, str]:
     return {u: pooled.get(u, "outlier") for u in context.facts.groups}
 
 
-def showcase(context: Context, episodes: HeldOut) -> tuple[int, ...]:
+def showcase(context: Context, episodes: HeldOut) -> tuple[EpisodeKey, ...]:
     """Choose the episodes to display: nominal, worst off-nominal, and the nominal unit in every other condition."""
     home, uncertain = context.facts.identify_on, context.uncertain
     others = sorted({k.condition for k in episodes.keys} - {home})
@@ -137,11 +134,9 @@ def showcase(context: Context, episodes: HeldOut) -> tuple[int, ...]:
 
 def free_run_percent(outcome: Outcome, episodes: HeldOut, pooled: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return median and worst free-run error over the pooled units, channel by channel."""
-    places = {unit: rows for (unit, _), rows in episodes.groups.items()}
-    per_unit = np.array([outcome.summary.percent[places[u]].mean(axis=0) for u in pooled if u in places])
-    median, worst = np.median(per_unit, axis=0), per_unit.max(axis=0)
-    states = episodes.population.states
-    return {c: {"median": float(m), "worst": float(w)} for c, m, w in zip(states, median, worst, strict=True)}
+    rows = [row for row in episodes.rows("", outcome, dict.fromkeys(episodes.parameters, "")) if row["unit"] in pooled]
+    errors = {c: [r["error_percent"] for r in rows if r["channel"] == c] for c in episodes.population.states}
+    return {c: {"median": float(np.median(of)), "worst": max(of)} for c, of in errors.items()}
 
 
 def load_observers(context: Context) -> dict[str, Observer]:
@@ -155,11 +150,11 @@ def _arrays(
 ) -> dict[str, AnyArray]:
     """Collect the trajectories that figures need, in single precision."""
     arrays = dict[str, Array]()
-    for number, i in enumerate(episodes.shown):
+    for number, key in enumerate(episodes.shown):
         start = f"shown{number}"
-        arrays[f"{start}/states"], arrays[f"{start}/inputs"] = episodes.population.read_parts(episodes.keys[i])
-        arrays |= {f"{start}/observer/{name}": outcome.shown[number] for name, outcome in estimates.items()}
-        free = {name: outcome for name, outcome in free_runs.items() if number < len(outcome.shown)}
-        arrays |= {f"{start}/model/{name}": outcome.shown[number] for name, outcome in free.items()}
+        arrays[f"{start}/states"], arrays[f"{start}/inputs"] = episodes.population.read_parts(key)
+        for kind, results in (("observer", estimates), ("model", free_runs)):
+            shown = {f"{start}/{kind}/{name}": outcome.shown for name, outcome in results.items()}
+            arrays |= {name: of[key] for name, of in shown.items() if key in of}
     with np.errstate(over="ignore"):  # an estimate that diverged becomes infinite
         return {name: values.astype(np.float32) for name, values in arrays.items()}

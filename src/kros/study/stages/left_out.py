@@ -118,10 +118,10 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     facts, population, record = whole.facts, whole.population.select(held), context.observers_record
     units = unit_parameters(population, context.calibration, facts.identify_on, facts)
     keys = tuple(k for k in facts.test if k.unit in held)
-    episodes = HeldOut(population, keys, units, sensor=context.config.sensor)
-    results, band, roles = outcomes(context, estimation(context, episodes)), band_hz(whole), dict.fromkeys(held, FOLDER)
+    episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(whole))
+    results, roles = outcomes(context, estimation(context, episodes)), dict.fromkeys(held, FOLDER)
     estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
-    rows = [row for item in estimates.items() for row in episodes.rows(*item, roles, band)]
+    rows = [row for item in estimates.items() for row in episodes.rows(*item, roles)]
     others = {name: facts_of(name, outcome) for name, outcome in results.items() if name not in record["facts"]}
     parameters = {unit: values for unit, values in units.items() if values}
     content = {"units": held, "parameters": parameters, "rows": rows, "observers": {**record["facts"], **others}}
@@ -157,9 +157,9 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     keys, rows = tuple(k for k in test if k.unit in known), Rows()
     if keys:
         observer = Observer.load(context.store.path("observers", "deployed.json"))
-        episodes = HeldOut(whole, keys, known, sensor=context.config.sensor)
+        episodes = HeldOut(whole, keys, known, sensor=context.config.sensor, band_hz=band_hz(context))
         (outcome,) = episodes.observers([observer])
-        rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"), band_hz(context))
+        rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"))
     lost = dict.fromkeys((k.unit, k.condition) for k in test if k.unit in failed)
     base = {"observer": deployed, "role": "reserve"} | dict.fromkeys(_MEASURES, float("inf"))
     return rows + [{**base, "unit": u, "condition": c, "channel": s} for u, c in lost for s in whole.states], failed

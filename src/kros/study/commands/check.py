@@ -21,19 +21,10 @@ from ...report.unit_verdicts import Rows, with_verdict
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import Evidence, Recorded, score_row
 from ...uncertainty.outliers.score import FEWEST_UNITS, Status
-from ..config import Stage, StudyConfig
+from ..config import Stage
+from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
-from ..engine.store import Store, open_finished
-from .field import (
-    DEPLOYED,
-    FieldRecordings,
-    check_channels,
-    hidden_states,
-    identify_on,
-    load_calibration,
-    open_data,
-    status_counts,
-)
+from .field import DEPLOYED, FieldRecordings, check_channels, hidden_states, open_data, status_counts
 
 STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)
 Judged = list[tuple[Array, Flags]]  # innovations, and which samples are judged
@@ -44,28 +35,29 @@ def check_units(run: Path, data: Path, workers: int, same_unit: bool) -> Rows:
 
     A name of a unit of the study is refused for other recordings, unless `same_unit` says it is the same machine.
     """
-    with open_finished(run, *STAGES) as (config, store):
-        return verdicts(config, store, data, workers, same_unit)
+    with open_finished(run, *STAGES) as context:
+        return verdicts(context, data, workers, same_unit)
 
 
-def verdicts(config: StudyConfig, store: Store, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:
+def verdicts(context: Context, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:
     """Do the same in a run that is open."""
-    rows = scored(config, store, data, workers, same_unit)
+    rows = scored(context, data, workers, same_unit)
     return [plain(with_verdict(row)) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
 
 
-def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool) -> Rows:
+def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     """Score the units of some recordings."""
+    store = context.store
     pattern = re.compile("outliers/([^/]+)/outlier_model.json")
     names = [m[1] for name in sorted(store.files()) if (m := pattern.fullmatch(name))]
     observer = Observer.load(store.path(*DEPLOYED)) if store.holds(*DEPLOYED) else None
-    population = open_data(config, data, hidden_states(observer) if observer else ())
+    population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
     watched: Rows = []
     if observer is not None:
         hidden = any(name not in population.states for name in observer.recorded)
         if hidden or observer.monitor is not None:
-            watched = monitored(FieldRecordings.open(config, store, data))
+            watched = monitored(FieldRecordings.open(context, data))
         if hidden:
             return watched
         check_channels(population, observer)
@@ -87,12 +79,17 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_uni
     with open_executor(workers) as executor:
         for name, models in known.items():
             outliers = OutlierModel.load(store.path("outliers", name))
-            rows += score_condition(store, population, models, outliers, executor, same_unit)
+            rows += score_condition(context, population, models, outliers, executor, same_unit)
     return [row | levels.get((row["unit"], row["condition"]), {}) for row in rows]
 
 
 def score_condition(
-    store: Store, population: Population, models: ModelSet, outliers: OutlierModel, executor: Executor, same_unit: bool
+    context: Context,
+    population: Population,
+    models: ModelSet,
+    outliers: OutlierModel,
+    executor: Executor,
+    same_unit: bool,
 ) -> Rows:
     """Score all units that were recorded in one condition."""
     condition, training = models.condition, training_keys(population)
@@ -100,9 +97,9 @@ def score_condition(
     units = [u for u in population.unit_ids if training.get((u, condition))]
     parameters: dict[str, dict[str, float]] = {u: {} for u in units}
     if models.lifting.parameters:
-        parameters = unit_parameters(population.select(units), load_calibration(store), identify_on(store))
+        parameters = unit_parameters(population.select(units), context.calibration, context.facts.identify_on)
     tasks = [(population.select([u], [condition]), everything[u], models.lifting) for u in units]
-    factors = EpisodeFactors.load(store.path("factors", quote(condition, safe="")))
+    factors = EpisodeFactors.load(context.store.path("factors", quote(condition, safe="")))
     recorded, rows = Recorded.of(factors, models, outliers.freqs_hz), Rows()
     halves = recorded.halves()
     motion = None if halves is None else outliers.motion_levels(*halves)

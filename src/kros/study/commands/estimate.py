@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import ConfigError, Record, load_artifact, write_bytes
+from ...core import ConfigError, Record, write_bytes
 from ...export.estimates import ENDINGS, writer
 from ...observer import recorded_channel, recorded_factors
 from ..config import Stage
-from ..engine.store import open_finished
+from ..engine.context import open_finished
 from .field import FieldRecordings, status_counts
 
 
@@ -23,15 +23,15 @@ def estimate_recordings(
 
     The band is the bound of the RMS error for recorded signals, where the observer has one and the sample is good.
     """
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
         if out.exists() or out.suffix not in ENDINGS:
             raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
         if plot is not None and plot.suffix != ".png":
             raise ConfigError(f"--plot {plot}: should end in .png.")
-        recordings = FieldRecordings.open(config, store, data, given, track)
+        recordings = FieldRecordings.open(context, data, given, track)
         observer, population = recordings.observer, recordings.population
         names = observer.recorded
-        stated = load_artifact(store.path("observers"), "observers")[0]["facts"].get(observer.name, {})
+        stated = context.observers_record["facts"].get(observer.name, {})
         bound = np.array([stated.get("set_bound", {}).get(name) for name in names], dtype=float)
         factors = recorded_factors(observer, [*(c.name for c in population.channels), *names])
         counts, n, first = defaultdict[str, Counter[str]](Counter), len(names), None

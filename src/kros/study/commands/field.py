@@ -22,20 +22,17 @@ from ...core import (
     Names,
     did_you_mean,
     frozen,
-    load_artifact,
     read_toml,
 )
 from ...data import EpisodeKey, Population, read
 from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
-from ...identify import PhaseCalibration
 from ...identify.calibration import Texts, Values, unit_values
-from ...identify.survey import RecordingFacts
 from ...observer import Observer, SampleStatus
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config
-from ..engine.store import Store
+from ..engine.context import Context
 from ..stages.learning import ARRAYS
 from ..stages.load import LOAD
 
@@ -100,17 +97,12 @@ def check_channels(population: Population, observer: Observer, *, hidden: bool =
         )
 
 
-def identify_on(store: Store) -> str:
-    """Return the condition that feeds synthesis in a run."""
-    return RecordingFacts.load(store.path("population")).identify_on
-
-
-def load_observer(store: Store, name: str = "deployed") -> Observer:
+def load_observer(context: Context, name: str = "deployed") -> Observer:
     """Load an observer of a run by its name; that of a load has the channels of the one that is deployed."""
+    store = context.store
     if not store.holds(*DEPLOYED):
         raise ConfigError(f"Run {store.folder}: has no deployed observer; run the study at least until synthesize.")
-    names = load_artifact(store.path("observers"), "observers")[0]["names"]
-    known = {"deployed": DEPLOYED} | {one: ("observers", f"{one}.json") for one in names}
+    known = {"deployed": DEPLOYED} | {n: ("observers", f"{n}.json") for n in context.observers_record["names"]}
     known |= {f"{k}/{LOAD}": (LOAD, f"{k}.json") for k in ("koopman", "linear") if store.holds(LOAD, f"{k}.json")}
     if name not in known:
         raise ConfigError(
@@ -122,11 +114,6 @@ def load_observer(store: Store, name: str = "deployed") -> Observer:
         return chosen
     about = Observer.load(store.path(*DEPLOYED)).about
     return replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
-
-
-def load_calibration(store: Store) -> PhaseCalibration | None:
-    """Return the run's calibration, where it has one."""
-    return PhaseCalibration.load(store.path("calibration")) if store.holds("calibration", "calibration.json") else None
 
 
 def parse_given(texts: Collection[str], units: Collection[str], known: Collection[str]) -> Values:
@@ -159,17 +146,18 @@ class FieldRecordings:
 
     @classmethod
     def open(
-        cls, config: StudyConfig, store: Store, data: Path, given: Collection[str] = (), track: str | None = None
+        cls, context: Context, data: Path, given: Collection[str] = (), track: str | None = None
     ) -> FieldRecordings:
         """Open what `data` names, and settle the parameters of every unit."""
-        observer = load_observer(store)
+        observer = load_observer(context)
         known = observer.lifting.parameters
         if track is not None and track not in known:
             raise ConfigError(f"--track {track}: the observer's parameters are {', '.join(known) or 'none'}.")
-        population = with_gaps(open_data(config, data, hidden_states(observer)))
+        population = with_gaps(open_data(context.config, data, hidden_states(observer)))
         check_channels(population, observer, hidden=False)
         chosen = parse_given(given, population.unit_ids, known)
-        values, sources, reasons = unit_values(population, load_calibration(store), identify_on(store), chosen)
+        home = context.facts.identify_on
+        values, sources, reasons = unit_values(population, context.calibration, home, chosen)
         return cls(observer, population, values, sources, track)._settled(reasons)
 
     def _settled(self, reasons: Texts) -> FieldRecordings:

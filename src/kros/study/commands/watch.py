@@ -15,9 +15,9 @@ from ...core import ConfigError, KrosError, Record, digest_of, write_json
 from ...core.files import draft_beside, is_file, link_or_copy, stamp_of
 from ...data.readers.parquet import INDEX
 from ...report.unit_verdicts import worst
-from ..config import StudyConfig
+from ..engine.context import Context, open_finished
 from ..engine.lock import locked
-from ..engine.store import Store, load_run, open_finished
+from ..engine.store import Store, load_run
 from .check import STAGES, verdicts
 
 Waiting = dict[Path, Path]  # recordings, a file or a folder of Parquet, by where their results will be
@@ -36,9 +36,9 @@ def watch(folder: Path, run: Path, out: Path | None, every_s: float, once: bool)
         Store(out).tidy()
         while (now := waiting(folder, out)) or not once:
             if rest := {place: path for place, path in now.items() if place in before}:
-                with open_finished(run, *STAGES) as (config, store):
+                with open_finished(run, *STAGES) as context:
                     for place, path in rest.items():
-                        yield from judged(config, store, path, place, folder, out)
+                        yield from judged(context, path, place, folder, out)
             before = now
             time.sleep(every_s)
 
@@ -60,7 +60,7 @@ def place_of(path: Path, changing: Path, folder: Path, out: Path) -> Path:
     return out / f"{path.relative_to(folder.parent)}.{digest_of(stamp_of(changing))[:12]}.json"
 
 
-def judged(config: StudyConfig, store: Store, path: Path, place: Path, folder: Path, out: Path) -> Iterator[str]:
+def judged(context: Context, path: Path, place: Path, folder: Path, out: Path) -> Iterator[str]:
     """Check one recording, alone in a folder like its own, and write its result; yield its line, none if it changed."""
     name, result = str(path.relative_to(folder)).encode(errors="backslashreplace").decode(), Record()
     with draft_beside(out) as draft:
@@ -69,7 +69,7 @@ def judged(config: StudyConfig, store: Store, path: Path, place: Path, folder: P
                 target = draft / path.relative_to(folder)
                 target.parent.mkdir(parents=True)
                 link_or_copy(path, target)
-            rows = verdicts(config, store, draft if path.is_file() else path)
+            rows = verdicts(context, draft if path.is_file() else path)
             result = {"verdict": worst(rows), "reason": "; ".join(row["reason"] for row in rows), "rows": rows}
         except (KrosError, OSError) as error:
             reason = str(error).replace(str(draft), str(folder))

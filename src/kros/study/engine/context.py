@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 
 from ...core import Names, Record, digest_of, frozen, load_artifact, stamp_of, write_json
 from ...core.work import Results, Work
@@ -19,7 +21,8 @@ from ...identify.survey import RecordingFacts
 from ...lifting import Lifting
 from ...uncertainty import UncertainModels
 from ..config import Stage, StudyConfig
-from .store import METRICS, STUDY, Store, code_key
+from .lock import locked
+from .store import METRICS, STUDY, Store, code_key, load_run
 
 
 @frozen
@@ -59,7 +62,8 @@ class Context:
     @cached_property
     def calibration(self) -> PhaseCalibration | None:
         """What the calibrate stage left, where the lifting has a phase."""
-        return None if self.phase_spec is None else PhaseCalibration.load(self.store.path("calibration"))
+        known = self.store.holds("calibration", "calibration.json")
+        return PhaseCalibration.load(self.store.path("calibration")) if known else None
 
     @cached_property
     def identified(self) -> IdentifiedModels:
@@ -80,6 +84,16 @@ class Context:
     def evaluation(self) -> Record:
         """What the evaluate stage left: errors of observers and baselines."""
         return load_artifact(self.store.path("evaluation"), "evaluation")[0]
+
+
+@contextmanager
+def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[Context]:
+    """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
+    load_run(folder)
+    with locked(folder, shared=not alone):
+        config, store = load_run(folder)
+        store.verify(*stages)
+        yield Context(config, store, Work())
 
 
 log = logging.getLogger(__name__)

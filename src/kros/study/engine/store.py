@@ -275,16 +275,6 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
                 folder.rmdir()
 
 
-@contextmanager
-def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[tuple[StudyConfig, Store]]:
-    """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
-    load_run(folder)
-    with locked(folder, shared=not alone):
-        config, store = load_run(folder)
-        store.verify(*stages)
-        yield config, store
-
-
 def load_run(folder: Path) -> tuple[StudyConfig, Store]:
     """Read the study of a run folder."""
     folder = Path(folder)

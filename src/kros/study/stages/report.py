@@ -7,9 +7,8 @@ from pathlib import Path
 
 from ...core import Progress
 from ..config import Stage
-from ..engine.context import Context
+from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
-from ..engine.store import open_finished
 
 REPORT = "report.html"
 
@@ -27,8 +26,8 @@ def render_run(folder: Path, workers: int) -> Path:
     """Write the report of a finished run again; `workers` processes draw its figures."""
     from ...report.html import render
 
-    with open_finished(folder, alone=True) as (_, store), open_executor(workers) as executor:
-        return render(store.folder, store.metrics(), executor.map)
+    with open_finished(folder, alone=True) as context, open_executor(workers) as executor:
+        return render(folder, context.store.metrics(), executor.map)
 
 
 def write_figures(folder: Path, out: Path, progress: Progress | None = None) -> list[str]:

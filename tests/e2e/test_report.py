@@ -158,7 +158,7 @@ def test_page_in_a_browser(page, tmp_path) -> None:
 def test_points_carry_the_names_of_their_units() -> None:
     units = ("000000", "001", HOSTILE, "002")
     phases = {unit: UnitPhase(0.5 * i, -0.9, 0.99, 12) for i, unit in enumerate(units)}
-    svg = to_svg(phase_figure(PhaseCalibration(PhaseSpec(), -0.9, phases)), "phase")
+    svg = to_svg(phase_figure(PhaseCalibration(PhaseSpec(), -0.9, phases), units), "phase", "Phases")
     marks = dict(re.findall(r'<use data-unit="([^"]*)"[^>]* x="([\d.]+)"', svg.replace("\n", " ")))
     order = [unit.replace("<", "&lt;").replace(">", "&gt;") for unit in units]
     assert sorted(marks, key=lambda unit: float(marks[unit])) == order  # the horizontal axis is units in order

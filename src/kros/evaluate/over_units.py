@@ -13,15 +13,13 @@ was fixed before (V. Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import ceil
-from typing import Any
 
 import numpy as np
 
-from ..core import ITERATED, Array, ArrayLike, DataError
+from ..core import ITERATED, Array, ArrayLike, ByName, DataError, Names, Record
 
-Row = Mapping[str, Any]
 _CELL = ("observer", "condition", "channel")
 
 
@@ -61,9 +59,9 @@ def unit_interval(values: ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[
     return result.confidence_interval.low, result.confidence_interval.high
 
 
-def interval_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def interval_rows(rows: Sequence[ByName]) -> list[Record]:
     """Return the 95 % ``interval`` of the mean error over at least three units, by observer, condition and channel."""
-    errors: dict[tuple[str, ...], dict[str, Any]] = {}
+    errors: dict[Names, Record] = {}
     for row in (row for row in rows if row["role"] == "off_nominal"):
         errors.setdefault(tuple(row[name] for name in _CELL), {})[row["unit"]] = row["error_percent"]
     intervals = []
@@ -76,7 +74,7 @@ def interval_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return intervals
 
 
-def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]:
+def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> Names:
     """Draw units that take part in nothing, by place alone; more of them include fewer."""
     drawn = np.random.default_rng(seed).permutation(len(units))[:n]
     return tuple(units[i] for i in sorted(drawn))

@@ -80,7 +80,7 @@ def lines_of_units(axes: Axes, x: AnyArray, lines: AnyArray, colour: str, label:
     axes.autoscale_view()
 
 
-def name_units(drawn: Artist, units: Sequence[str]) -> None:
+def name_units(drawn: Artist, units: Iterable[str]) -> None:
     """Name the units behind the lines or points of an artist, in their order: the page shows them on hover."""
     drawn.set_gid("units-" + ",".join(quote(unit, safe="") for unit in units))
 

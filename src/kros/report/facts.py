@@ -14,11 +14,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..core import ByName, Names, frozen
+from ..core.arrays import T
 from ..data import OUTLIERS, natural_key
 from ..design.task import split_name
 from .names import observer_label, readable_unit
 
-T = TypeVar("T")
 K = TypeVar("K")
 Rows = Sequence[ByName]
 _CELL = ("condition", "observer", "channel")
@@ -160,6 +160,11 @@ class Facts:
     def table(self) -> ErrorTable | None:
         """Errors in the condition that the deployed observer was designed for; None where it has not been evaluated."""
         return self.tables[0] if self.tables and self.deployed in self.tables[0].cells else None
+
+    @property
+    def cells(self) -> Mapping[str, ErrorCell]:
+        """Errors of the deployed observer in this condition, by channel."""
+        return self.table.cells[self.deployed] if self.table is not None else {}
 
     @property
     def hidden(self) -> list[str]:

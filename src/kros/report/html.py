@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from ..core import ByName, Record, write_bytes
 from .content import Section
 from .facts import Facts
-from .figures import draw
+from .figures import Drawn, draw
 from .files import to_svg
 from .names import condition_label
 from .run_folder import RunFolder
@@ -23,9 +23,7 @@ from .verdict import judge
 log = logging.getLogger(__name__)
 _TEMPLATES = Path(__file__).parent / "templates"
 
-Encoded = dict[str, str]
-"""A figure as the page shows it: name, title, svg and caption, or the reason why it is left out."""
-Mapped = Callable[[Callable[[str], Encoded], Iterable[str]], Iterator[Encoded]]
+Mapped = Callable[[Callable[[str], Drawn], Iterable[str]], Iterator[Drawn]]
 
 
 def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = None) -> Path:
@@ -40,16 +38,13 @@ def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = 
 
 def page(run: RunFolder, metrics: ByName, mapped: Mapped = map) -> str:
     """Return the report as HTML."""
-    from markupsafe import Markup
-
     facts = Facts(metrics)
     parts = [[s for make in makers if (s := make(facts)) is not None] for makers in (FIRST, EVIDENCE)]
     names = [section.figure for part in parts for section in part if section.figure]
-    figures = {}
-    for drawn in mapped(partial(encoded, RunFolder(run.folder)), names):
-        if drawn["reason"]:
-            log.info("figure %s: left out, %s", drawn["name"], drawn["reason"])
-        figures[drawn["name"]] = {**drawn, "svg": Markup(drawn["svg"])}
+    figures = {drawn.name: drawn for drawn in mapped(partial(encoded, RunFolder(run.folder)), names)}
+    for drawn in figures.values():
+        if drawn.reason:
+            log.info("figure %s: left out, %s", drawn.name, drawn.reason)
     aside = len(facts.set_aside)
     count = f"{facts.study['units']} units" + (f" and {aside} set aside" if aside else "")
     conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
@@ -60,24 +55,20 @@ def page(run: RunFolder, metrics: ByName, mapped: Mapped = map) -> str:
 def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) -> str:
     """Return a page of sections; `parts` are a summary, more sections as evidence, and figures by name."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
 
-    loader = FileSystemLoader(_TEMPLATES)
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    loader, strict = FileSystemLoader(_TEMPLATES), StrictUndefined
+    pages = Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     absent: Record = {"head": None, "evidence": (), "figures": {}}
-    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": Markup(stylesheet())}
-    script = Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8"))
-    return environment.get_template("report.html.jinja").render(absent | parts, script=script)
+    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": stylesheet()}
+    script = (_TEMPLATES / "report.js").read_text(encoding="utf-8")
+    return pages.get_template("report.html.jinja").render(absent | parts, script=script)
 
 
-def encoded(run: RunFolder, name: str) -> Encoded:
-    """Draw a figure and return it as the page shows it."""
+def encoded(run: RunFolder, name: str) -> Drawn:
+    """Draw a figure as the page shows it."""
     drawn = draw(name, run)
-    svg = "" if drawn.figure is None else to_svg(drawn.figure, name)
-    svg = svg.replace('role="img"', f'role="img" aria-label="{escape(drawn.title)}"', 1)
-    return vars(drawn) | {"svg": svg, "figure": None}
+    svg = "" if drawn.figure is None else to_svg(drawn.figure, name, drawn.title)
+    return replace(drawn, svg=svg, figure=None)
 
 
 def stylesheet() -> str:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
-from typing import TypeVar
 
 from ..core import frozen
+from ..core.arrays import T
 from ..data import DEFAULT_CONDITION, EpisodeKey
 from ..design.baselines import BASELINES
 from ..design.methods import METHODS
 from ..design.task import Label, split_name
 from .theme import Tone
 
-T = TypeVar("T")
 LABELS = {method.name: method.label for method in METHODS} | BASELINES
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

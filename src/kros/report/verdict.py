@@ -101,9 +101,8 @@ def _numbers(facts: Facts) -> list[Number]:
     """Return the errors of at most two hidden channels, and how many units are flagged."""
     numbers = []
     for channel in facts.hidden[:2]:
-        cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else ErrorCell()
+        cell, known = facts.cells[channel], facts.cells[channel].means
         if cell.mean is not None:
-            known = cell.means
             notes = [f"RMS {number(known['rms'])} {facts.unit(channel)}".strip()] if known.get("rms") else []
             notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
             if error := known.get("true_error_percent"):
@@ -130,10 +129,10 @@ def _stopping(facts: Facts) -> Checks:
         yield "The run stopped before an observer was designed.", "Run it to its end.", "run"
     elif table is None:
         yield f"“{facts.label}” has not been evaluated.", "Run it to its end.", "run"
-    elif any(table.cells[facts.deployed][c].mean is None for c in hidden):
+    elif any(facts.cells[c].mean is None for c in hidden):
         text = f"The estimates of “{facts.label}” diverge on held-out episodes."
         yield text, "Do not use it; look at the models first.", "models"
-    elif hidden and not_improved(table, facts.deployed, hidden) == hidden:
+    elif hidden and not_improved(facts, table) == hidden:
         text = f"“{facts.label}” is no better than its model without correction."
         yield text, f"Measure a signal that depends more on {channels(hidden)}.", "errors"
     left = tables_of(facts.get("left_out", {}).get("rows", []), facts.study["identify_on"])
@@ -172,13 +171,9 @@ def _of_units(facts: Facts) -> Checks:
         need = f"{most['unit']} needs {number(most['needed_s'])} s, has {number(most['recorded_s'])} s"
         yield _inconclusive(short, rows), f"Record longer: {need}.", "units"
     if few := [r for r in undecided(rows) if r["status"] == "cannot tell"]:
-        yield (
-            _inconclusive(few, rows),
-            "Score against more units in one condition, at least 8, that are more alike.",
-            "units",
-        )
-    remarks = [f"{r['unit']} ({r['status']})" for r in facts.get("units", []) if r.get("status", "ok") != "ok"]
-    if remarks:
+        action = "Score against more units in one condition, at least 8, that are more alike."
+        yield _inconclusive(few, rows), action, "units"
+    if remarks := [f"{r['unit']} ({r['status']})" for r in facts.get("units", []) if r.get("status", "ok") != "ok"]:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
 
 
@@ -202,18 +197,17 @@ def _of_errors(facts: Facts) -> Checks:
         export = f"`kros export c --observer {better}` exports it."
         action = export if designed else "It is a baseline that is not exported."
         yield text, f"Compare both. {action}", "errors"
-    same = not_improved(table, facts.deployed, hidden)
+    same = not_improved(facts, table)
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."
         yield text, "Do not rely on the estimate more than on the model.", "errors"
-    errors = {c: table.cells[facts.deployed][c].mean for c in hidden}
-    if large := {c: e for c, e in errors.items() if e is not None and e > 100 * THRESHOLDS.large}:
+    errors = {c: facts.cells[c].mean or 0.0 for c in hidden}
+    if large := {c: error for c, error in errors.items() if error > 100 * THRESHOLDS.large}:
         each = joined([f"{words(c)} ({number(e)} % of the largest value)" for c, e in large.items()])
         yield f"The error is large: {each}.", "Measure another signal, or use the estimate for trends alone.", "errors"
     for channel, bound in (facts.entry.get("set_bound") or {}).items():
-        cell = table.cells[facts.deployed].get(channel)
-        if cell is not None and cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
-            unit = facts.unit(channel)
+        cell, unit = facts.cells.get(channel, ErrorCell()), facts.unit(channel)
+        if cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
             text = f"A held-out episode exceeds the largest RMS error expected: {words(channel)} of unit "
             text += f"{cell.worst_unit} has {number(cell.worst_rms)} {unit}, expected were {number(bound)} {unit}."
             yield text, "Do not rely on this number; record more kinds of episodes.", "certificates"
@@ -281,12 +275,13 @@ def voids(facts: Facts) -> list[str]:
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]
 
 
-def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:
-    """Return the channels in which an observer is no better than its model without correction."""
-    other = f"{split_name(name)[0]}/open_loop"
-    if name == other or other not in table.cells:
+def not_improved(facts: Facts, table: ErrorTable) -> list[str]:
+    """Return the hidden channels in which the deployed observer is no better than its model without correction."""
+    other = f"{facts.model}/open_loop"
+    if facts.deployed == other or other not in table.cells:
         return []
-    return [c for c in channels if not _smaller(table, name, other, [c], 1 - THRESHOLDS.improved)]
+    ratio = 1 - THRESHOLDS.improved
+    return [c for c in facts.hidden if not _smaller(table, facts.deployed, other, [c], ratio)]
 
 
 def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:

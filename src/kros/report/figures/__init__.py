@@ -46,13 +46,14 @@ FIGURES: dict[str, Row] = {
 
 @frozen
 class Drawn:
-    """A figure, or the reason why it is left out; `name` is also the name of its file."""
+    """A figure, in the end as SVG, or the reason why it is left out; `name` is also the name of its file."""
 
     name: str
     title: str
     figure: Figure | None = None
     caption: str = ""
     reason: str = ""
+    svg: str = ""
 
 
 def drawing(place: str) -> Callable[..., Any]:

@@ -66,7 +66,7 @@ def free_run(run: RunFolder) -> Captioned:
 
 def estimates(run: RunFolder, paper: bool = False) -> Captioned:
     """Draw estimates for the nominal and the worst off-nominal unit (the paper's Figures 11 and 12)."""
-    shown = [s for s in run.shown if s.key.condition == run.identify_on][:2]
+    shown = [s for s in run.shown if s.key.condition == run.facts.identify_on][:2]
     if not shown or not shown[0].observers:
         raise NotShownError("no observer was run on the episodes that are shown")
     known = shown[0].observers
@@ -85,14 +85,14 @@ def estimates(run: RunFolder, paper: bool = False) -> Captioned:
 
 def other_condition(run: RunFolder) -> Captioned:
     """Draw the paper's observers, or the deployed one, in a condition that no model has seen (Figures 13 and 14)."""
-    shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
+    shown = next((s for s in run.shown if s.key.condition != run.facts.identify_on), None)
     if shown is None or not shown.observers:
         raise NotShownError("the recordings have one condition only")
     pair = observer_pair(published(shown.observers))
     names = pair or observer_pair(shown.observers, run.deployed)
     block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), DRAWING.states)))
     text = _PAPER if pair else ""
-    text += f"Designed in “{condition_label(run.identify_on)}” alone; errors are recorded minus estimated values."
+    text += f"Designed in “{condition_label(run.facts.identify_on)}” alone; errors are recorded minus estimated values."
     return _figure(run, [block], text)
 
 

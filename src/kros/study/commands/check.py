@@ -132,8 +132,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
             samples += len(arrived.y)
             counts.update(status_counts(screened(observer, arrived.y, arrived.u).status))
             if monitor is not None:
-                values = arrived.parameters(observer)
-                nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
+                nu, good = run_innovations(observer, arrived.y, arrived.u, arrived.parameters, monitor.settle)
                 judged.append((nu[:, 0], good[:, 0]))
         level = None
         if monitor is not None and any(good.any() for _, good in judged):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -49,15 +49,10 @@ def estimate_recordings(
         units = {name: recorded_channel(observer, name).unit for name in names}
         write_bytes(plot, estimates_png(population.sample_period_s, drawn, units))
     count = len(population.episodes)
-    return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
-
-
-def unit_lines(sources: Mapping[str, str], counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Return a line a unit with the source of its parameters and its samples by status, where there is any."""
-    lines = []
-    for unit in dict.fromkeys([*sources, *(u for u, of_unit in counts.items() if of_unit)]):
-        parts = [f"parameters {sources[unit]}"] if unit in sources else []
-        parts += [f"{count} samples {bit}" for bit, count in counts.get(unit, {}).items()]
+    lines = [f"estimates of {count} episode{'s' * (count != 1)} in {out}"]
+    for unit in dict.fromkeys([*recordings.sources, *(unit for unit, of_unit in counts.items() if of_unit)]):
+        parts = [f"parameters {recordings.sources[unit]}"] if unit in recordings.sources else []
+        parts += [f"{count} samples {bit}" for bit, count in counts[unit].items()]
         lines.append(f"  unit {unit}: {'; '.join(parts)}")
     return lines
 

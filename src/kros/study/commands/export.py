@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ...core import ConfigError, KrosError, write_json
-from ...data import EpisodeBatch
 from ...data.discovery.roles import identifier
-from ...evaluate.sensor import as_arriving
+from ...evaluate.sensor import Arriving, arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
 from ...loops.compiler import find_compiler
 from ...observer import Observer, recorded_factors, run_observer
@@ -59,17 +58,14 @@ def exactness(folder: Path, observer: Observer, context: Context) -> str:
     if sample := compiled.selftest():
         raise ConfigError(f"Export: the self-test of {folder} fails at sample {sample}; do not use it, and report it.")
     try:
-        batch = held_out_episode(context)
+        arrived = held_out_episode(observer, context)
     except KrosError as error:
         return f"not compared with Python, since the run's recordings cannot be read: {error}"
-    arriving = as_arriving(batch, observer.sensor, observer.recorded[: batch.states.shape[-1]])
-    y = arriving.measurements(observer.measured)
-    parameters = observer.own(batch.parameters)
-    wanted = run_observer(observer, y, batch.inputs, parameters)[1:, 0, : len(observer.recorded)]
-    measured = observer.outputs
-    of_y, of_u, of_x = (recorded_factors(observer, n) for n in (measured, observer.inputs, observer.recorded))
-    values = {name: float(np.ravel(value)[0]) for name, value in parameters.items()}
-    estimates, _ = compiled.run(y[:, 0] / of_y, batch.inputs[:, 0] / of_u, values)
+    wanted = run_observer(observer, arrived.y, arrived.u, arrived.parameters)[1:, 0, : len(observer.recorded)]
+    signals = observer.outputs, observer.inputs, observer.recorded
+    of_y, of_u, of_x = (recorded_factors(observer, names) for names in signals)
+    values = {name: np.ravel(value).item() for name, value in arrived.parameters.items()}
+    estimates, _ = compiled.run(arrived.y[:, 0] / of_y, arrived.u[:, 0] / of_u, values)
     apart = 100 * np.abs(estimates[:-1] * of_x - wanted).max(axis=0) / np.abs(wanted).max(axis=0)
     differences = ", ".join(f"{name} {value:.1g} %" for name, value in zip(observer.recorded, apart, strict=True))
     if not (apart <= TOO_COARSE).all():
@@ -77,11 +73,12 @@ def exactness(folder: Path, observer: Observer, context: Context) -> str:
     return f"differs from Python on a held-out episode by at most {differences} of the largest estimate"
 
 
-def held_out_episode(context: Context) -> EpisodeBatch:
+def held_out_episode(observer: Observer, context: Context) -> Arriving:
     """Return the first episode that no design knows, as far as code is compared on it."""
     calibration = context.calibration
     keys = [key for key in context.facts.test if calibration is None or key.unit in calibration.units]
     if not keys:
         raise ConfigError("no episode is held out.")
-    phase = {} if calibration is None else {calibration.spec.parameter: calibration.units[keys[0].unit].phase_rad}
-    return EpisodeBatch.read(open_source(context.config), keys[:1], LARGEST, {keys[0].unit: phase})
+    key, population = keys[0], open_source(context.config)
+    phase = {} if calibration is None else {calibration.spec.parameter: calibration.units[key.unit].phase_rad}
+    return arriving(observer, population, {key: population.read(key)[:LARGEST]}, {key.unit: phase})

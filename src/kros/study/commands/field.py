@@ -185,7 +185,7 @@ class FieldRecordings:
                 chosen[key] = next(self.population.blocks(key, _BLOCK))
         arrived = arriving(self.observer, self.population, chosen, {unit: values})
         step, known = 2 * np.pi / _PHASES, {**self.observer.parameters, **values}
-        signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
+        signals = (self.observer, arrived.y, arrived.u, arrived.lengths, known, name)
         coarse = least_innovation(*signals, np.arange(_PHASES) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
@@ -211,7 +211,7 @@ class FieldRecordings:
         for block in self.population.blocks(key, _BLOCK):
             values, lead = np.concatenate([before, block]), len(before)
             arrived = arriving(observer, self.population, {key: values}, self._parameters)
-            course = course or Course(observer, 1, arrived.parameters(observer), loop)
+            course = course or Course(observer, 1, arrived.parameters, loop)
             run = course.take(arrived.y[lead:], arrived.u[lead:])
             columns = run.estimates[:, 0, :n]
             if loop is not None:

@@ -17,9 +17,10 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from functools import partial
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 from ...core import ConfigError, Executor, KrosError, MissingDependencyError, Progress, frozen
+from ...core.arrays import T
 from .store import code_key
 
 
@@ -53,7 +54,6 @@ class Lines(Progress):
             sys.stderr.flush()
 
 
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 _BATCHES, _LARGEST = 1000, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")

@@ -28,19 +28,19 @@ Pieces = dict[Names, Callable[[], Any]]  # work by the names of its results
 
 def run(context: Context) -> None:
     """Evaluate and save errors and the trajectories that are displayed."""
-    facts, population, roles = context.facts, context.population, unit_roles(context)
-    known, models = context.identified.parameters, context.identified.models()
-    units = {u: known[u] for u in facts.groups if u in models.unit_ids}
+    facts, population, identified = context.facts, context.population, context.identified
+    units = {u: identified.parameters[u] for u in facts.groups if u in identified.models().unit_ids}
     keys = tuple(k for k in facts.test if k.unit in units)
     episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(context))
     episodes = replace(episodes, shown=showcase(context, episodes))
     at_home = replace(episodes, keys=tuple(k for k in keys if k.condition == facts.identify_on))
     observers = load_observers(context)
-    kinds = {name: context.identified.models(name) for name in context.identified.kinds}
     work = estimation(context, episodes)
-    work |= {(f"free run/{name}",): partial(at_home.models, one) for name, one in kinds.items()}
+    work |= {(f"free run/{name}",): partial(at_home.models, identified.models(name)) for name in identified.kinds}
     results = outcomes(context, work)
-    free_runs: dict[str, Outcome] = {name: results.pop(f"free run/{name}") for name in kinds}  # type: ignore[misc]
+    free_runs: Any = {name: results.pop(f"free run/{name}") for name in identified.kinds}
+    pooled = {u: "off_nominal" for u in facts.pooled} | {context.uncertain.nominal: "nominal"}
+    roles = {u: pooled.get(u, "outlier") for u in facts.groups}
     estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
     content: Record = {
         "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles)],
@@ -114,12 +114,6 @@ def band_hz(context: Context) -> tuple[float, float] | None:
     first = context.identified.models()
     top_speed = float(first.input_scale[first.inputs.index(spec.reference)]) if spec.reference in first.inputs else 0.0
     return gearbox_band_hz(context.config.calibrate, context.population, top_speed)
-
-
-def unit_roles(context: Context) -> dict[str, str]:
-    """Return for every unit whether it is the nominal one, another of the population, or filed as an outlier."""
-    pooled = {u: "off_nominal" for u in context.facts.pooled} | {context.uncertain.nominal: "nominal"}
-    return {u: pooled.get(u, "outlier") for u in context.facts.groups}
 
 
 def showcase(context: Context, episodes: HeldOut) -> tuple[EpisodeKey, ...]:

@@ -88,11 +88,13 @@ def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) 
     observer, left_out = load_observer(
         f"{kind}/{LOAD}", lifting, trial.measured, inputs, trial.train, trial.truth[0], read
     )
-    observer = replace(observer, seen=seen_by(context.identified, observer.measured))
+    nominal = context.identified.parameters[context.uncertain.nominal]
+    seen = seen_by(context.identified, observer.measured)
+    observer = replace(observer, seen=seen, parameters={n: nominal[n] for n in lifting.parameters})
     observer.save(context.store.draft(LOAD, f"{kind}.json"))
     estimate = run_observer(observer, test.measurements(trial.measured), test.inputs, observer.own(test.parameters))
-    seen = estimate[..., observer.lifting.states.index("load")]
-    load = leveled.run(seen, estimate[..., current], test.states[..., angle]).load
+    estimated = estimate[..., observer.lifting.states.index("load")]
+    load = leveled.run(estimated, estimate[..., current], test.states[..., angle]).load
     return load, {"order": observer.internal, "episodes_left_out": len(left_out)}
 
 

@@ -332,7 +332,7 @@ def clock(observer: Observer, track: str | None, data: HeldOut, given: argparse.
         np.ascontiguousarray(data.y[:, 0]),
         np.ascontiguousarray(data.u[:, 0]),
     )
-    readme = c_files(observer, Source.of(observer, "observer", "double", track))["README.md"]
+    readme = c_files(Source.of(observer, "observer", "double", track))["README.md"]
     operations = int(next(row for row in readme.splitlines() if row.startswith("| multiplications")).split("|")[2])
     context, rows = (
         Source.of(observer, "observer", "double").context(),

@@ -44,7 +44,7 @@ def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
 
 @frozen
 class Outcome:
-    """What one observer, baseline or model did on some episodes."""
+    """What one observer, baseline or model did on some episodes; one that could not be made has facts alone."""
 
     errors: dict[EpisodeKey, list[Record]] = field(default_factory=dict)  # by state, and by key in the metrics
     shown: dict[EpisodeKey, Array] = field(default_factory=dict)  # estimates, (n_samples, n)
@@ -129,7 +129,7 @@ class HeldOut:
     def rows(self, name: str, outcome: Outcome, roles: Mapping[str, str]) -> list[Record]:
         """Return a row for every unit, condition and estimated channel: means over the unit's episodes."""
         columns, rows = outcome.estimated, list[Record]()
-        for (unit, condition), keys in self.groups.items():
+        for (unit, condition), keys in self.groups.items() if outcome.errors else ():
             about = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition}
             for j, channel in enumerate(self.population.states):
                 if columns is None or j in columns:

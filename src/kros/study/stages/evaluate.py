@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ...core import AnyArray, Array, ByName, KrosError, Names, Record, save_artifact
+from ...core import AnyArray, Array, KrosError, Names, Record, save_artifact
 from ...data import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
@@ -38,19 +38,18 @@ def run(context: Context) -> None:
     work = estimation(context, episodes)
     work |= {(f"free run/{name}",): partial(at_home.models, identified.models(name)) for name in identified.kinds}
     results = outcomes(context, work)
-    free_runs: Any = {name: results.pop(f"free run/{name}") for name in identified.kinds}
+    free_runs = {name: results.pop(f"free run/{name}") for name in identified.kinds}
     pooled = {u: "off_nominal" for u in facts.pooled} | {context.uncertain.nominal: "nominal"}
     roles = {u: pooled.get(u, "outlier") for u in facts.groups}
-    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
     content: Record = {
-        "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles)],
+        "rows": [row for item in results.items() for row in episodes.rows(*item, roles)],
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
         "band_hz": episodes.band_hz,
         "shown": [[k.unit, k.condition, k.episode] for k in episodes.shown],
-        "baselines": {name: facts_of(name, outcome) for name, outcome in results.items() if name not in observers},
+        "baselines": {name: outcome.facts for name, outcome in results.items() if name not in observers},
         **episodes.recorded_rows(roles),
     }
-    arrays = _arrays(episodes, estimates, free_runs)
+    arrays = _arrays(episodes, results, free_runs)
     save_artifact(context.store.draft("evaluation"), "evaluation", content, arrays)
     run_load(context, observers)
 
@@ -64,21 +63,24 @@ def estimation(context: Context, episodes: HeldOut) -> Pieces:
     return work
 
 
-def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome | str:
+def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome:
     """Make a baseline and run it; return the reason where it cannot be made."""
     try:
         baseline = make()
     except KrosError as error:
-        return str(error)
+        return Outcome(facts={"status": "failed", "reason": str(error)})
     (outcome,) = episodes.estimates(lambda *batch: [baseline.estimate(*batch)[None]], baseline.measured)
     return replace(outcome, facts=baseline.facts, estimated=baseline.estimated)
 
 
-def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:
+def outcomes(context: Context, work: Pieces) -> dict[str, Outcome]:
     """Do the work; return outcomes by name, observers of the study first, in its order."""
-    by_name = dict[str, Outcome | str]()
+    by_name = dict[str, Outcome]()
     for names, result in zip(work, context.work.run("evaluate", work.values()), strict=True):
         by_name |= dict(zip(names, result if isinstance(result, list) else [result], strict=True))
+    for name, outcome in by_name.items():
+        if outcome.facts.get("status") == "failed":
+            log.info("%s could not be computed: %s", name, outcome.facts["reason"])
     return {name: by_name[name] for name in dict.fromkeys((*context.observers_record["names"], *by_name))}
 
 
@@ -96,14 +98,6 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     makers |= {"mean_profile": profile, "learned": partial(make_learned, whole, first.measured)}
     makers |= {kind: partial(make_trained, whole, first.measured, kind) for kind in get_args(Regressor)}
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
-
-
-def facts_of(name: str, result: Outcome | str) -> ByName:
-    """Return what the records say about a baseline that was made here."""
-    if isinstance(result, Outcome):
-        return result.facts
-    log.info("%s could not be computed: %s", name, result)
-    return {"status": "failed", "reason": result}
 
 
 def band_hz(context: Context) -> tuple[float, float] | None:

@@ -19,14 +19,14 @@ import numpy as np
 
 from ...core import ConfigError, IdentificationError, KrosError, Progress, Record, load_artifact, save_artifact
 from ...data import split_episodes
-from ...evaluate.held_out import HeldOut, Outcome
+from ...evaluate.held_out import HeldOut
 from ...evaluate.over_units import fewest_units, next_unit_bound
 from ...identify.calibration import Values, unit_parameters
 from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
-from .evaluate import band_hz, estimation, facts_of, outcomes
+from .evaluate import band_hz, estimation, outcomes
 from .learning import FEWEST, LEARNING
 
 log = logging.getLogger(__name__)
@@ -114,9 +114,8 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     keys = tuple(k for k in facts.test if k.unit in held)
     episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(whole))
     results, roles = outcomes(context, estimation(context, episodes)), dict.fromkeys(held, FOLDER)
-    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
-    rows = [row for item in estimates.items() for row in episodes.rows(*item, roles)]
-    others = {name: facts_of(name, outcome) for name, outcome in results.items() if name not in record["facts"]}
+    rows = [row for item in results.items() for row in episodes.rows(*item, roles)]
+    others = {name: outcome.facts for name, outcome in results.items() if name not in record["facts"]}
     parameters = {unit: values for unit, values in units.items() if values}
     content = {"units": held, "parameters": parameters, "rows": rows, "observers": {**record["facts"], **others}}
     save_artifact(context.store.draft("evaluation"), KIND, content)

@@ -160,8 +160,8 @@ class LoadTrial:
         """Return errors of an estimate for the metrics."""
         skip = round(TRIAL.settle_s / self.dt)
         accuracy = load_accuracy(estimate, self.truth[1], self.dt, TRIAL.judged_hz, skip)
-        row = {"observer": name} | {name: getattr(accuracy, name) for name in ("load_rms", "floor_rms", "error_rms")}
-        return row | {"error_percent": accuracy.percent, "error_to_floor": accuracy.ratio}
+        errors = {"error_percent": accuracy.percent, "error_to_floor": accuracy.ratio}
+        return {"observer": name, **vars(accuracy), **errors}
 
 
 def _known(context: Context, usable: list[str]) -> tuple[list[str], list[str]]:

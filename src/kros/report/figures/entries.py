@@ -13,14 +13,12 @@ from ..names import model_label, shorten, words
 from ..theme import DRAWING, Tone
 
 Names = tuple[Sequence[str], Sequence[str]]
-_OUTPUT_ROWS = (Form.ADDITIVE, Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
-_OUTPUT_COLUMNS = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_ADDITIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
 
 
 def entry_names(form: Form, models: ModelSet) -> Names:
     """Return the signals behind the rows and the columns of a form's residual."""
     outputs, inputs = models.lifting.names, models.inputs
-    return outputs if form in _OUTPUT_ROWS else inputs, outputs if form in _OUTPUT_COLUMNS else inputs
+    return inputs if form.at_input else outputs, inputs if form.sees_input else outputs
 
 
 def short(name: str) -> str:

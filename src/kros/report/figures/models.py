@@ -36,7 +36,7 @@ def identified_step(models: IdentifiedModels, model: str | None = None, conditio
 def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
     """Draw magnitude beside phase, a row a state and a pair of columns an input; the unit `nominal` stands out."""
     freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
-    response = models.systems().frequency_response(freqs) * (models.input_scale / models.output_scale[:, None])
+    response = models.scaled_responses(freqs)
     rows, inputs = min(response.shape[2], DRAWING.states), min(response.shape[3], 2)
     values = (decibel(response), np.degrees(np.unwrap(np.angle(response), axis=1)))
     figure, axes = grid(rows, 2 * inputs, sharex=True)

@@ -14,9 +14,9 @@ from ..theme import DRAWING, Tone
 
 def scores(run: RunFolder) -> Captioned:
     """Draw one point a unit with its range, flagged ones in the colour of alarm, a column a condition."""
-    models = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
-    first = next(iter(models.values()))
-    flagged = sorted({s.unit for m in models.values() for s in m.scores if s.outlier}, key=natural_key)
+    models = dict(sorted(run.outlier_models.items(), key=lambda item: natural_key(item[0])))
+    first, scores = next(iter(models.values())), [score for model in models.values() for score in model.scores]
+    flagged = sorted({score.unit for score in scores if score.outlier}, key=natural_key)
     about = (
         f"Excess of the largest {words(first.form.value)} residual of a unit over those of all others: median over all "
         "nominal units, and as a bar the range over them"
@@ -27,7 +27,7 @@ def scores(run: RunFolder) -> Captioned:
     text += f"Above it: {some(flagged)}." if flagged else "No unit is above it."
     if not any(np.isfinite(m.threshold_db) for m in models.values()):
         text = f"{about}. There is no threshold with fewer than eight units."
-    units = sorted({s.unit for m in models.values() for s in m.scores}, key=natural_key)
+    units = sorted({score.unit for score in scores}, key=natural_key)
     figure, axes = grid(1, len(models), sharey=True)
     for panel, (condition, model) in zip(axes[0], models.items(), strict=True):
         _panel(panel, model, units)
@@ -42,8 +42,8 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
     for score in model.scores:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
-        ends = [score.lowest_db + shift, score.highest_db + shift]
-        axes.plot([place, place], ends, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
+        ends = score.lowest_db + shift, score.highest_db + shift
+        axes.plot([place] * 2, ends, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
         (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone)
         name_units(point, [score.unit])
         if score.outlier or score is highest:

@@ -38,13 +38,12 @@ FORM_TONES = {
     Form.INVERSE_OUTPUT_MULTIPLICATIVE: Tone.ORANGE,
 }
 _PUBLISHED = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  # the input forms agree for tall plants
-_INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 
 
 def forms(run: RunFolder) -> Captioned:
     """Draw the largest residuals in all forms, linear beside Koopman (the paper's Figure 7)."""
     chosen = run.uncertain
-    tall = {n: m for n, m in chosen.items() if n in run.models and len(m.output_scale) > len(m.input_scale)}
+    tall = {n: m for n, m in chosen.items() if len(m.output_scale) > len(m.input_scale)}
     published = {n: published_bounds(m, run.models[n]) for n, m in tall.items()}  # these contain the identity
     used = words(next(iter(chosen.values())).form.value)
     text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
@@ -64,10 +63,13 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
     """Return frequencies and bounds of the output forms as published."""
     freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.frequencies)]
     response = models.scaled_responses(freqs, model.unit_ids)
-    rows = {form: model.nominals.get(form) for form in _PUBLISHED}
-    nominals = {f: model.unit_ids.index(unit) if unit in model.unit_ids else 0 for f, unit in rows.items()}
-    sizes = {f: sigma_max(residual(f, response[row], response, paper=True)) for f, row in nominals.items()}
-    return {f: (freqs, np.delete(size, nominals[f], axis=0).max(axis=0)) for f, size in sizes.items()}
+    bounds = dict[Form, tuple[AnyArray, AnyArray]]()
+    for form in _PUBLISHED:
+        unit = model.nominals.get(form)
+        row = model.unit_ids.index(unit) if unit in model.unit_ids else 0
+        size = sigma_max(residual(form, response[row], response, paper=True))
+        bounds[form] = freqs, np.delete(size, row, axis=0).max(axis=0)
+    return bounds
 
 
 def draw_forms(axes: Axes, model: UncertainModel) -> None:
@@ -94,7 +96,8 @@ def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResidu
     """Draw the weights of a kind of model, and every unit relative to them, a row a kind."""
     figure, axes = grid(len(rows), 3, sharex=True)
     for row, (name, (model, models, residuals)) in zip(axes, rows.items(), strict=True):
-        _draw_weights(row, model, models.inputs if model.form in _INPUT_SIDE else ())
+        both = model.form.at_input and model.form.sees_input
+        _draw_weights(row, model, models.inputs if both else ())
         ratio_panel(row[2], residuals)
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
     set_titles(axes[0], ("left weight", "right weight", "units relative to the weights"))
@@ -147,7 +150,7 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     levels = decibel(residuals.ratio)[rows]
     names = [residuals.unit_ids[k] for k in rows]
     lines_of_units(axes, freqs, levels, Tone.BLUE, "units", names)
-    first = int(np.nanargmax(np.nanmax(np.where(np.isfinite(levels), levels, -np.inf), axis=1)))
+    first = int(np.where(np.isfinite(levels), levels, -np.inf).max(axis=1).argmax())
     axes.plot(freqs, levels[first], color=Tone.INK)
     note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK)
     axes.axhline(0, color=Tone.ALARM, lw=DRAWING.thin, ls="--")

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 
-from ...core import Array, ConfigError, DataError, Executor, Flags, Record, plain
+from ...core import Array, ConfigError, DataError, Executor, Flags, plain
 from ...data import Population
 from ...data.recording import check_population
 from ...identify import ModelSet
-from ...identify.calibration import training_keys, unit_parameters
+from ...identify.calibration import Values, training_keys, unit_parameters
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
 from ...observer import Observer, run_innovations, screened
@@ -48,12 +47,12 @@ def verdicts(context: Context, data: Path, workers: int = 1, same_unit: bool = F
 def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     """Score the units of some recordings."""
     store = context.store
-    pattern = re.compile("outliers/([^/]+)/outlier_model.json")
-    names = [m[1] for name in sorted(store.files()) if (m := pattern.fullmatch(name))]
+    folders = (name.split("/") for name in sorted(store.files()) if name.endswith("/outlier_model.json"))
+    names = [name for _, name, _ in folders]
     observer = Observer.load(store.path(*DEPLOYED)) if store.holds(*DEPLOYED) else None
     population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
-    watched: Rows = []
+    watched = Rows()
     if observer is not None:
         hidden = any(name not in population.states for name in observer.recorded)
         if hidden or observer.monitor is not None:
@@ -75,7 +74,7 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
             "name the condition, as in the study."
         )
     levels = {(r["unit"], r["condition"]): {k: r[k] for k in r if k.startswith("level_")} for r in watched}
-    rows: Rows = []
+    rows = Rows()
     with open_executor(workers) as executor:
         for name, models in known.items():
             outliers = OutlierModel.load(store.path("outliers", name))
@@ -95,7 +94,7 @@ def score_condition(
     condition, training = models.condition, training_keys(population)
     everything = {unit: keys for unit, c, keys in population.groups() if c == condition}
     units = [u for u in population.unit_ids if training.get((u, condition))]
-    parameters: dict[str, dict[str, float]] = {u: {} for u in units}
+    parameters: Values = {u: {} for u in units}
     if models.lifting.parameters:
         parameters = unit_parameters(population.select(units), context.calibration, context.facts.identify_on)
     tasks = [(population.select([u], [condition]), everything[u], models.lifting) for u in units]
@@ -138,10 +137,21 @@ def monitored(recordings: FieldRecordings) -> Rows:
         if monitor is not None and any(good.any() for _, good in judged):
             level = float(monitor.level(np.concatenate(monitor.in_turn(judged))).max())
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
-        row: Record = dict.fromkeys(("score", "threshold", "detectable"))
-        row |= {"unit": unit, "condition": condition, "outlier": outlier, "episodes": len(keys), "left_out": []}
-        row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "missing": missing, "level_db": level}
-        row |= {"level_rate": monitor and monitor.false_alarm_rate, "level_units": monitor and monitor.units}
-        row |= {"recorded_s": samples * population.sample_period_s, "samples": counts}
-        rows.append(row | {"parameters": recordings.sources.get(unit)})
+        row = {
+            **dict.fromkeys(("score", "threshold", "detectable")),
+            "unit": unit,
+            "condition": condition,
+            "outlier": outlier,
+            "episodes": len(keys),
+            "left_out": [],
+            "status": Status.OUTLIER if outlier else Status.CANNOT_TELL,
+            "missing": missing,
+            "level_db": level,
+            "level_rate": monitor and monitor.false_alarm_rate,
+            "level_units": monitor and monitor.units,
+            "recorded_s": samples * population.sample_period_s,
+            "samples": counts,
+            "parameters": recordings.sources.get(unit),
+        }
+        rows.append(row)
     return rows

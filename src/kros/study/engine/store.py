@@ -68,10 +68,6 @@ class Store:
         """Return the run folder of a study that the running stage makes in its draft."""
         return Store(self.draft(*parts), shared=self.artefacts)
 
-    def record(self, stage: str) -> Artefact | None:
-        """Return the artefact of a finished stage, or None."""
-        return self.manifest.get(stage)
-
     def files(self) -> frozenset[str]:
         """Return the names of all files that belong to the run."""
         return recorded_files(self.folder)
@@ -131,7 +127,7 @@ class Store:
 
     def add(self, stage: str, artefact: Artefact) -> None:
         """Name an artefact of the store in the manifest, in place of an earlier one, and put its files into place."""
-        entry, earlier = artefact.model_copy(update={"results": ()}), self.record(stage)
+        entry, earlier = artefact.model_copy(update={"results": ()}), self.manifest.get(stage)
         if earlier != entry:
             if earlier is not None and earlier.digest != entry.digest:
                 self.drop(stage)
@@ -266,7 +262,7 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
                     write_json(store.path(STUDY), config.dump())
                 yield store
             except (ConfigError, DataError, DimensionError):
-                if fresh and store.record(Stage.READ) is None:
+                if fresh and Stage.READ not in store.manifest:
                     store.remove()
                 raise
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 from urllib.parse import quote
@@ -47,8 +48,8 @@ def verdicts(context: Context, data: Path, workers: int = 1, same_unit: bool = F
 def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     """Score the units of some recordings."""
     store = context.store
-    folders = (name.split("/") for name in sorted(store.files()) if name.endswith("/outlier_model.json"))
-    names = [name for _, name, _ in folders]
+    matches = (re.fullmatch("outliers/([^/]+)/outlier_model.json", name) for name in sorted(store.files()))
+    names = [match[1] for match in matches if match]
     observer = Observer.load(store.path(*DEPLOYED)) if store.holds(*DEPLOYED) else None
     population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)

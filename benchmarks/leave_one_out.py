@@ -34,7 +34,8 @@ from kros.data import write_parquet
 from kros.design.task import split_name
 from kros.evaluate import unit_interval
 from kros.plants import HarmonicDrivePopulation
-from kros.report.facts import ErrorCell, ErrorTable, tables_of
+from kros.report.facts import ErrorCell, ErrorTable
+from kros.report.facts import Facts as Metrics
 from kros.report.names import label_of, minus, number
 from kros.study import load_config
 from kros.study.config import Stage
@@ -126,7 +127,7 @@ def left_out_tables(rows: Sequence[Mapping[str, Any]], home: str) -> list[ErrorT
         if len(errors) > 1 and None not in errors:
             intervals.append({**group[0], "interval": unit_interval(errors)})
     tables = []
-    for table in tables_of(rows, home, intervals):
+    for table in Metrics({"study": {"identify_on": home}}).tables_of(rows, intervals):
         cells = {
             name: {
                 c: LeftOutCell(

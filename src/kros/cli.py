@@ -286,7 +286,7 @@ def run(
 
 
 def _finish(result: Any, quiet: bool) -> None:
-    _show(quiet, result.metrics, [] if quiet else result.summary().splitlines()[1:])
+    _show(quiet, result.metrics, result.summary().splitlines()[1:])
 
 
 @app.command()

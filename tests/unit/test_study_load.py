@@ -39,6 +39,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
             population=population,
             sizes=dict.fromkeys(population.states + population.inputs, 7.0),
         ),
+        uncertain=SimpleNamespace(nominal="001001"),
         store=Store(folder),
     )
 

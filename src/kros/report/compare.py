@@ -96,7 +96,7 @@ def deployed(facts: Facts) -> Record:
         "reasons": " ".join(reason.text for reason in verdict.reasons),
         "states": facts.entry.get("order"),
         "settles after (samples)": facts.entry.get("settle_samples"),
-        "time of the study (s)": facts.get("timing_s", {}).get("total"),
+        "time of the study (s)": facts.get("timing_s").get("total"),
     }
 
 
@@ -106,7 +106,7 @@ def errors(facts: Facts) -> Record:
     for table in facts.tables:
         where = f", {table.condition}" if len(facts.tables) > 1 else ""
         for name, cells in table.cells.items():
-            for channel in table.hidden(facts.measured, name):
+            for channel in table.hidden(name):
                 what = f"{name}: {channel}{where}"
                 rows |= {what: cells[channel].shown, f"{what}, worst unit": cells[channel].worst}
     return rows
@@ -114,8 +114,8 @@ def errors(facts: Facts) -> Record:
 
 def weights(facts: Facts) -> Record:
     """Return form, nominal and weights of every kind of model, and the units flagged."""
-    rows = of_each(facts.get("uncertainty", {}), "form", "nominal", "peak_db", "weight")
-    flagged = [f"{r['unit']} ({r['condition']})" for r in facts.get("outliers", ()) if r["outlier"]]
+    rows = of_each(facts.get("uncertainty"), "form", "nominal", "peak_db", "weight")
+    flagged = [f"{r['unit']} ({r['condition']})" for r in facts.get("outliers") if r["outlier"]]
     return rows | ({"units flagged": ", ".join(flagged) or "none"} if rows else {})
 
 

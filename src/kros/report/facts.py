@@ -60,12 +60,13 @@ class ErrorTable:
 
     condition: str
     cells: Mapping[str, Mapping[str, ErrorCell]]
+    measured: Names = ()
 
-    def hidden(self, measured: Sequence[str], observer: str | None = None) -> list[str]:
+    def hidden(self, observer: str | None = None) -> list[str]:
         """Return the channels that are not measured and that an observer estimates, or any does; else all of them."""
-        estimated = self.cells.values() if observer is None else [self.cells[observer]]
+        estimated = self.cells.values() if observer is None else [self.cells.get(observer, {})]
         known = dict.fromkeys(c for channels in estimated for c in channels)
-        return [c for c in known if c not in measured] or list(known)
+        return [c for c in known if c not in self.measured] or list(known)
 
     def mean(self, observer: str, channels: Sequence[str]) -> float:
         """Return the geometric mean of an observer's mean errors; infinite where one is not known."""
@@ -73,17 +74,6 @@ class ErrorTable:
         if not values or None in values:
             return float("inf")
         return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), np.finfo(float).tiny)))))
-
-
-def tables_of(rows: Rows, identify_on: str, intervals: Rows = ()) -> list[ErrorTable]:
-    """Return rows of errors by condition, that of the models first, observer and channel."""
-    place, tables = itemgetter(*_CELL), dict[str, dict[str, dict[str, ErrorCell]]]()
-    known = {place(row): row["interval"] for row in intervals}
-    for (condition, name, channel), units in grouped(rows, place).items():
-        cell = _cell(units, known.get((condition, name, channel), ()))
-        tables.setdefault(condition, {}).setdefault(name, {})[channel] = cell
-    ordered = sorted(tables, key=lambda condition: (condition != identify_on, natural_key(condition)))
-    return [ErrorTable(condition, tables[condition]) for condition in ordered]
 
 
 def _cell(rows: Sequence[Any], interval: Sequence[float]) -> ErrorCell:
@@ -105,14 +95,14 @@ class Facts:
 
     metrics: ByName
 
-    def get(self, name: str, otherwise: Any = None) -> Any:
-        """Return a part of the metrics, or what is given otherwise."""
-        return self.metrics.get(name, otherwise)
+    def get(self, name: str) -> Any:
+        """Return a part of the metrics, empty where it is absent."""
+        return self.metrics.get(name, {})
 
     @property
     def set_aside(self) -> list[str]:
         """Units that take no part in pooled results."""
-        return [row["unit"] for row in self.get("units", ()) if row.get("group") == OUTLIERS]
+        return [row["unit"] for row in self.get("units") if row.get("group") == OUTLIERS]
 
     @property
     def study(self) -> ByName:
@@ -127,7 +117,7 @@ class Facts:
     @property
     def observers(self) -> Mapping[str, ByName]:
         """What is known of every observer."""
-        return self.get("observers", {})
+        return self.get("observers")
 
     @property
     def deployed(self) -> str:
@@ -149,27 +139,38 @@ class Facts:
         """Model of the deployed observer."""
         return split_name(self.deployed)[0]
 
+    def tables_of(self, rows: Rows, intervals: Rows = ()) -> list[ErrorTable]:
+        """Return rows of errors by condition, that of the models first, observer and channel."""
+        place, tables = itemgetter(*_CELL), dict[str, dict[str, dict[str, ErrorCell]]]()
+        known = {place(row): row["interval"] for row in intervals}
+        for (condition, name, channel), units in grouped(rows, place).items():
+            cell = _cell(units, known.get((condition, name, channel), ()))
+            tables.setdefault(condition, {}).setdefault(name, {})[channel] = cell
+        home = self.study["identify_on"]
+        ordered = sorted(tables, key=lambda condition: (condition != home, natural_key(condition)))
+        return [ErrorTable(condition, tables[condition], self.measured) for condition in ordered]
+
     @cached_property
     def tables(self) -> list[ErrorTable]:
         """Errors of all observers on the units that took part, a table a condition, that of the models first."""
-        rows = [r for r in self.get("evaluation", []) if r["role"] in ("nominal", "off_nominal")]
+        rows = [r for r in self.get("evaluation") if r["role"] in ("nominal", "off_nominal")]
         others = [r for r in rows if r["role"] == "off_nominal"] or rows
-        return tables_of(others, self.study["identify_on"], self.get("intervals", ()))
+        return self.tables_of(others, self.get("intervals"))
 
     @property
-    def table(self) -> ErrorTable | None:
-        """Errors in the condition that the deployed observer was designed for; None where it has not been evaluated."""
-        return self.tables[0] if self.tables and self.deployed in self.tables[0].cells else None
+    def table(self) -> ErrorTable:
+        """Errors in the condition that the deployed observer was designed for; empty where it was not evaluated."""
+        return next((table for table in self.tables[:1] if self.deployed in table.cells), ErrorTable("", {}))
 
     @property
     def cells(self) -> Mapping[str, ErrorCell]:
         """Errors of the deployed observer in this condition, by channel."""
-        return self.table.cells[self.deployed] if self.table is not None else {}
+        return self.table.cells.get(self.deployed, {})
 
     @property
     def hidden(self) -> list[str]:
         """Channels that the deployed observer estimates and that are not measured."""
-        return self.table.hidden(self.measured, self.deployed) if self.table is not None else []
+        return self.table.hidden(self.deployed)
 
     def unit(self, channel: str) -> str:
         """Return the unit of measure of a channel; nothing where there is none."""

@@ -12,7 +12,7 @@ from operator import itemgetter
 from ..core import ByName, frozen
 from ..data import some
 from ..design.task import split_name
-from .facts import ErrorCell, ErrorTable, Facts, grouped, tables_of
+from .facts import ErrorCell, ErrorTable, Facts, grouped
 from .names import condition_label, joined, label_of, number, observer_label, words
 
 Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the section with the details
@@ -124,20 +124,20 @@ def _lag(lag_s: float | None) -> str:
 
 def _stopping(facts: Facts) -> Checks:
     """Yield what stops, what to do, and where the details are."""
-    table, hidden = facts.table, facts.hidden
+    hidden = facts.hidden
     if not facts.deployed:
         yield "The run stopped before an observer was designed.", "Run it to its end.", "run"
-    elif table is None:
+    elif not facts.cells:
         yield f"“{facts.label}” has not been evaluated.", "Run it to its end.", "run"
     elif any(facts.cells[c].mean is None for c in hidden):
         text = f"The estimates of “{facts.label}” diverge on held-out episodes."
         yield text, "Do not use it; look at the models first.", "models"
-    elif hidden and not_improved(facts, table) == hidden:
+    elif hidden and not_improved(facts) == hidden:
         text = f"“{facts.label}” is no better than its model without correction."
         yield text, f"Measure a signal that depends more on {channels(hidden)}.", "errors"
-    left = tables_of(facts.get("left_out", {}).get("rows", []), facts.study["identify_on"])
-    cells = left[0].cells.get(facts.deployed, {}) if left else {}
-    if any(cell.mean is None for c, cell in cells.items() if c not in facts.measured):
+    left_out = facts.tables_of(facts.get("left_out").get("rows", ()))
+    lost = [c for table in left_out[:1] for c, cell in table.cells.get(facts.deployed, {}).items() if cell.diverged]
+    if set(lost) - set(facts.measured):
         text = "Designed without the unit that it runs on, this kind of observer diverges on some units."
         yield text, "Do not use it on new units.", "left-out"
 
@@ -146,7 +146,7 @@ def _of_recordings(facts: Facts) -> Checks:
     """Yield alerts of the recordings, confounded conditions, and too short recordings."""
     for alert in facts.study.get("alerts", ()):
         yield f"Recordings: {alert.rstrip('.')}.", "Look at the recordings.", "recordings"
-    rows = [row for row in facts.get("units", []) if row.get("conditions") and row.get("group") != "outliers"]
+    rows = [row for row in facts.get("units") if row.get("conditions") and row.get("group") != "outliers"]
     inside = [row for row in rows if facts.study["identify_on"] in row["conditions"]]
     if len(inside) < len(rows):
         single = all(len(row["conditions"]) == 1 for row in rows)
@@ -154,7 +154,7 @@ def _of_recordings(facts: Facts) -> Checks:
         text += f"Models and observers describe {len(inside)} of {len(rows)} units, those recorded in "
         text += f"“{condition_label(facts.study['identify_on'])}”."
         yield text, "Record all units in the same conditions.", "recordings"
-    noise = facts.get("uncertainty", {}).get(facts.model, {}).get("noise_share")
+    noise = facts.get("uncertainty").get(facts.model, {}).get("noise_share")
     if noise and noise["at_peak"] >= THRESHOLDS.noise:
         text = f"{100 * noise['at_peak']:.0f} % of the spread at {number(noise['peak_hz'])} Hz is estimation noise, "
         yield f"{text}not variation between units.", "Record longer, or more episodes.", "spread"
@@ -162,7 +162,7 @@ def _of_recordings(facts: Facts) -> Checks:
 
 def _of_units(facts: Facts) -> Checks:
     """Yield units that are flagged, undecided or have a remark."""
-    rows = facts.get("outliers", [])
+    rows = facts.get("outliers")
     if flagged := [r for r in rows if r["outlier"]]:
         text = f"Flagged as not belonging to the batch: {units_text(flagged)}."
         yield text, "Inspect these units before they are shipped.", "units"
@@ -173,7 +173,7 @@ def _of_units(facts: Facts) -> Checks:
     if few := [r for r in undecided(rows) if r["status"] == "cannot tell"]:
         action = "Score against more units in one condition, at least 8, that are more alike."
         yield _inconclusive(few, rows), action, "units"
-    if remarks := [f"{r['unit']} ({r['status']})" for r in facts.get("units", []) if r.get("status", "ok") != "ok"]:
+    if remarks := [f"{r['unit']} ({r['status']})" for r in facts.get("units") if r.get("status", "ok") != "ok"]:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
 
 
@@ -187,8 +187,6 @@ def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
 def _of_errors(facts: Facts) -> Checks:
     """Yield better observers, channels without improvement, and bounds that errors exceed."""
     table, hidden = facts.table, facts.hidden
-    if table is None:
-        return
     ratio, others = 1 - THRESHOLDS.better, [name for name in table.cells if name != facts.deployed]
     if rivals := [name for name in others if _smaller(table, name, facts.deployed, hidden, ratio)]:
         better = min(rivals, key=lambda name: table.mean(name, hidden))  # the most accurate one
@@ -197,7 +195,7 @@ def _of_errors(facts: Facts) -> Checks:
         export = f"`kros export c --observer {better}` exports it."
         action = export if designed else "It is a baseline that is not exported."
         yield text, f"Compare both. {action}", "errors"
-    same = not_improved(facts, table)
+    same = not_improved(facts)
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."
         yield text, "Do not rely on the estimate more than on the model.", "errors"
@@ -223,11 +221,11 @@ def _of_certificates(facts: Facts) -> Checks:
         yield text, "Do not rely on the bounds for these units.", "certificates"
     if facts.observers and all(label_of(name).baseline for name in facts.observers):
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
-    bound = facts.get("uncertainty", {}).get(facts.model, {}).get("weight", {}).get("cover_max")
+    bound = facts.get("uncertainty").get(facts.model, {}).get("weight", {}).get("cover_max")
     if bound is not None and bound > 1:
         action = "Use kros.quantify(models, max_order=6) in Python."
         yield "The weights do not bound all units that they were fitted to.", action, "uncertainty"
-    for fold, why in facts.get("left_out", {}).get("failed", {}).items():
+    for fold, why in facts.get("left_out").get("failed", {}).items():
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
 
 
@@ -275,13 +273,12 @@ def voids(facts: Facts) -> list[str]:
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]
 
 
-def not_improved(facts: Facts, table: ErrorTable) -> list[str]:
+def not_improved(facts: Facts) -> list[str]:
     """Return the hidden channels in which the deployed observer is no better than its model without correction."""
-    other = f"{facts.model}/open_loop"
-    if facts.deployed == other or other not in table.cells:
+    other, ratio = f"{facts.model}/open_loop", 1 - THRESHOLDS.improved
+    if facts.deployed == other or other not in facts.table.cells:
         return []
-    ratio = 1 - THRESHOLDS.improved
-    return [c for c in facts.hidden if not _smaller(table, facts.deployed, other, [c], ratio)]
+    return [c for c in facts.hidden if not _smaller(facts.table, facts.deployed, other, [c], ratio)]
 
 
 def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:

@@ -153,26 +153,25 @@ def run(
 
 def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: ByName) -> StudyConfig:
     """Return the study of some recordings, or a study, with keys of some tables changed."""
-    base, tables = Path(), dict(sections)
+    tables = dict(sections)
     if isinstance(source, Population):
         if set(tables.get("data", ())) & {"source", "reader"}:
             raise ConfigError("Run: data.source and data.reader name recordings, and a population is given; drop them.")
-        raw: Record = {"name": out.name, "data": {"source": learning.ARRAYS, "reader": learning.ARRAYS}}
-        base = out
+        raw: Record = {"name": out.name, "data": {"source": out / learning.ARRAYS, "reader": learning.ARRAYS}}
     elif isinstance(source, StudyConfig):
         raw = source.dump()
     elif not isinstance(source, str | Path):
         raise ConfigError(f"Run: needs a Population, a folder or a study, found {type(source).__name__}.")
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
-        raw = {"name": out.name, "data": {"source": str(source)} | ({"reader": reader} if reader else {})}
+        raw = {"name": out.name, "data": {"source": source} | ({"reader": reader} if reader else {})}
     else:
         raw = load_config(source).dump()
     if isinstance(tables.get("lifting"), list | tuple):
         tables["lifting"] = {"functions": tables["lifting"]}
     for name, table in tables.items():
         raw[name] = {**raw.get(name, {}), **table} if isinstance(table, Mapping) else table
-    return validate_config(raw, base, str(source) if isinstance(source, str | Path) else f"for {out}")
+    return validate_config(raw, Path(), str(source) if isinstance(source, str | Path) else f"for {out}")
 
 
 def require_usable(config: StudyConfig, until: Stage, population: Population | None = None) -> None:

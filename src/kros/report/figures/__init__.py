@@ -1,14 +1,13 @@
 """Figures: one row of one table each, in the order of the paper's argument.
 
-The function of a row takes a `RunFolder` and the options of the row; it returns the figure and more of its caption.
+The function of a row takes a `RunFolder`; it returns the figure and more of its caption.
 """
 
 from collections.abc import Callable
-from dataclasses import field
 from importlib import import_module
 from typing import Any
 
-from ...core import ByName, ConfigError, frozen
+from ...core import ConfigError, frozen
 from ..canvas import Figure
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
@@ -16,12 +15,11 @@ from ..theme import style
 
 @frozen
 class Row:
-    """A figure: its title, the module and function that draw it, the first sentence of its caption, and options."""
+    """A figure: its title, the module and function that draw it, and the first sentence of its caption."""
 
     title: str
     function: str
     see: str
-    options: ByName = field(default_factory=dict)
 
 
 _SMALL = "The smaller the error, the better the estimate."
@@ -36,7 +34,7 @@ FIGURES: dict[str, Row] = {
     "weights_entrywise": Row("Weights, entry by entry", "uncertainty:weights_entrywise", "Black bounds blue lines."),
     "synthesis": Row("Plant, weights and filters", "synthesis:bode", "High weights need a large correction."),
     "observers_in_time": Row("Estimates", "episodes:estimates", _SMALL),
-    "observers_in_time_paper": Row("The paper's estimates", "episodes:estimates", _SMALL, {"paper": True}),
+    "observers_in_time_paper": Row("The paper's estimates", "episodes:paper_estimates", _SMALL),
     "loaded_paper": Row("Errors in another condition", "episodes:other_condition", _SMALL),
     "load_torque": Row("Load torque", "load:load_torque", "The nearer to the declared load, the better."),
     "outlier_scores": Row("Outlier scores", "outliers:scores", "The higher a unit, the more it differs."),
@@ -67,7 +65,7 @@ def draw(name: str, run: RunFolder) -> Drawn:
     row = FIGURES[name]
     with style():
         try:
-            figure, text = drawing(row.function)(run, **row.options)
+            figure, text = drawing(row.function)(run)
             return Drawn(name, row.title, figure, f"{row.see} {text}".strip())
         except NotShownError as absent:
             return Drawn(name, row.title, reason=str(absent))

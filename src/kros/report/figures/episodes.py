@@ -96,6 +96,11 @@ def other_condition(run: RunFolder) -> Captioned:
     return _figure(run, [block], text)
 
 
+def paper_estimates(run: RunFolder) -> Captioned:
+    """Draw estimates of the paper's observers."""
+    return estimates(run, paper=True)
+
+
 def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[int]) -> Block:
     lines = {observer_label(n): (shown.observers[n], observer_look(n)) for n in names}
     return Block(title, shown, lines, states)

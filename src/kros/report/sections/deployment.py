@@ -28,14 +28,15 @@ def deployment(facts: Facts) -> Section | None:
     about = label_of(facts.deployed).about
     about = f": {about}" if about else ""
     assumed = "; ".join(facts.entry.get("assumptions") or ())
+    entry = facts.get("deployment")
     card = [
         ("Observer", [f"{facts.label}{about} (observers/deployed.json)."]),
-        *(_interface(facts, facts.get("deployment")) if facts.get("deployment") else []),
+        *(_interface(facts, entry) if entry else []),
         ("Certificate assumes", [f"{assumed[0].upper()}{assumed[1:]}."] if assumed else []),
         ("Next unit", _next_unit(facts.get("next_unit"))),
         ("Monitor", _monitor(facts.entry.get("monitor"))),
     ]
-    table = _needed(facts, facts.get("deployment", {}))
+    table = _needed(facts, entry)
     texts = [_GAINS] if table is not None else []
     return Section("deployment", "Deployment", texts, [(term, of) for term, of in card if of], [table])
 
@@ -70,7 +71,7 @@ def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
         ("Reads", [f"Measured: {named(entry['measured'])}. Inputs: {named(entry['inputs'])}."]),
         ("Estimates", [f"{joined(hidden)}, for the next sample; {delay}."]),
         ("Rate", [f"One step every {dt:g} s ({1 / dt:g} Hz), {entry['states']} states."]),
-        ("Parameters", _parameters(entry["parameters"], facts.get("calibration") is not None)),
+        ("Parameters", _parameters(entry["parameters"], bool(facts.get("calibration")))),
         ("Sensor", [f"Assumed for {axis_label(n, facts.unit(n))}: {text}." for n, text in assumed.items() if text]),
     ]
 

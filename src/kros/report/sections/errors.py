@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from ...design.task import split_name
 from ..content import Column, Row, Section, Table, build
-from ..facts import ErrorTable, Facts, tables_of
+from ..facts import ErrorTable, Facts
 from ..names import condition_label, in_condition, joined, label_of, number, observer_label, published, words
 
 _TEXT = (
@@ -56,7 +56,7 @@ def left_out(facts: Facts) -> Section | None:
     parts = [("made", "designed", ""), ("robust", "set of plants", "certified")]
     parts.append(("relift_certified", "at run time", "certified"))
     about, tables = [Column("observer"), *(Column(title, key, group) for key, title, group in parts)], []
-    for table in tables_of(folded["rows"], facts.study["identify_on"]):
+    for table in facts.tables_of(folded["rows"]):
         rows = []
         for name in table.cells:
             entry = folded["observers"].get(name, {})
@@ -88,7 +88,7 @@ def _table(
 ) -> Table | None:
     """Return errors of all hidden channels, a row an observer and condition."""
     columns = list(about)
-    for channel in dict.fromkeys(c for table in tables for c in table.hidden(facts.measured)):
+    for channel in dict.fromkeys(c for table in tables for c in table.hidden()):
         unit = facts.unit(channel)
         titles = {"mean": "mean (%)", "worst": "worst (%)", "rms": f"RMS ({unit})" if unit else "RMS"}
         titles |= {"true_error_percent": "against the true signal (%)", "lag": "lag (ms)"}
@@ -101,7 +101,7 @@ def _table(
 def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
     """Return the few observers that answer most questions, each with the roles it is compared in."""
     table, entries = facts.tables[0], facts.observers
-    channels = table.hidden(facts.measured)
+    channels = table.hidden()
     designed = [n for n in table.cells if not label_of(n).baseline]
     certified = [n for n in designed if entries.get(n, {}).get("worst_case_h2") is not None]
     certified = certified or [n for n in designed if entries.get(n, {}).get("set_certified")]

@@ -52,7 +52,7 @@ def calibration(facts: Facts) -> Section | None:
         "the phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse "
         f"apart. Mean lag of the loop: {minus(format(math.degrees(entry['lag_rad']), '.1f'))}°."
     )
-    missing = [row["unit"] for row in facts.get("units", []) if row["status"] == "not calibrated"]
+    missing = [row["unit"] for row in facts.get("units") if row["status"] == "not calibrated"]
     more = [f"Not calibrated, and without models: {some(missing)}."] if missing else []
     return Section("calibration", "Phase calibration", [text, *more], figure="phase")
 
@@ -132,7 +132,7 @@ def uncertainty(facts: Facts) -> Section | None:
 
 def run(facts: Facts) -> Section:
     """Return times, versions, and where the settings are."""
-    timing = facts.get("timing_s", {})
+    timing = facts.get("timing_s")
     times = [{"stage": stage, "seconds": float(seconds)} for stage, seconds in timing.items()]
     table = build("Time; a stage that was up to date counts in full", [Column("stage"), Column("seconds")], times)
     versions = [f"{name} {import_module(name).__version__}" for name in _PACKAGES]

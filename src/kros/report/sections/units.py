@@ -24,10 +24,10 @@ def units(facts: Facts) -> Section | None:
     """Return the table of units, flagged ones first; None where no unit is known."""
     if not facts.get("units"):
         return None
-    scores, home = facts.get("outliers", []), facts.study["identify_on"]
+    scores, home = facts.get("outliers"), facts.study["identify_on"]
     errors = [
         r
-        for r in facts.get("evaluation", [])
+        for r in facts.get("evaluation")
         if r["observer"] == facts.deployed and r["condition"] == home and r["channel"] not in facts.measured
     ]
     columns = [Column("unit"), Column("status")]

@@ -48,15 +48,13 @@ def _version(name: str, otherwise: str) -> str:
 
 def ranking(facts: Facts) -> list[str]:
     """Return one line an observer, the smallest error of the hidden channels first."""
-    table = facts.table
-    if table is None:
-        return []
-    hidden, rows = table.hidden(facts.measured), list[Row]()
+    table, hidden, rows = facts.table, facts.table.hidden(), list[Row]()
     for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
         means = {channel: cell.shown for channel, cell in table.cells[name].items()}
         rows.append({"": f"{name}{'  <- deployed' if name == facts.deployed else ''}", **means})
     title = "observers by mean error on held-out episodes, percent of the largest value:"
-    return lines(Section("", title, tables=[build("", [Column(name) for name in ("", *hidden)], rows)]))[1:]
+    shown = build("", [Column(name) for name in ("", *hidden)], rows)
+    return lines(Section("", title, tables=[shown]))[1:] if shown else []
 
 
 def list_run(run: Path) -> list[str]:

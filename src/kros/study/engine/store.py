@@ -127,10 +127,9 @@ class Store:
 
     def add(self, stage: str, artefact: Artefact) -> None:
         """Name an artefact of the store in the manifest, in place of an earlier one, and put its files into place."""
-        entry, earlier = artefact.model_copy(update={"results": ()}), self.manifest.get(stage)
-        if earlier != entry:
-            if earlier is not None and earlier.digest != entry.digest:
-                self.drop(stage)
+        entry = artefact.model_copy(update={"results": ()})
+        if self.manifest.get(stage) != entry:
+            self.drop(stage)
             write_manifest(self.folder, self.manifest | {stage: entry})
         for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
             self._link(self.artefacts / artefact.digest / name, place(self.folder, name))

@@ -34,9 +34,10 @@ def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, AnyArray]:
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
+def legend(axes: Axes, columns: int | None = None) -> None:
     """Write a legend across the top of the figure, from the labelled lines of one axes."""
     handles, labels = axes.get_legend_handles_labels()
+    figure: Any = axes.figure
     if handles:
         columns = columns or (len(handles) if sum(map(len, labels)) < 100 else 2)
         figure.set_figheight(figure.get_figheight() + DRAWING.legend_in * ceil(len(handles) / columns))

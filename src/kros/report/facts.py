@@ -17,7 +17,7 @@ from ..core import ByName, Names, frozen
 from ..core.arrays import T
 from ..data import OUTLIERS, natural_key
 from ..design.task import split_name
-from .names import observer_label, readable_unit
+from .names import observer_label, readable_unit, words
 
 K = TypeVar("K")
 Rows = Sequence[ByName]
@@ -175,3 +175,7 @@ class Facts:
     def unit(self, channel: str) -> str:
         """Return the unit of measure of a channel; nothing where there is none."""
         return readable_unit(self.study.get("channels", {}).get(channel, ""))
+
+    def axis(self, channel: str) -> str:
+        """Return a channel's name with its unit of measure."""
+        return f"{words(channel)} ({self.unit(channel)})" if self.unit(channel) else words(channel)

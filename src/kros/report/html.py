@@ -56,12 +56,15 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
     """Return a page of sections; `parts` are a summary, more sections as evidence, and figures by name."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+    light = "".join(f"{t.variable}:{t};" for t in Tone)
+    dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)  # the tones of the figures, for light and dark pages
+    style, script = ((_TEMPLATES / f"report.{end}").read_text(encoding="utf-8") for end in ("css", "js"))
+    style = style.replace("/* light tones */", light).replace("/* dark tones */", dark)
     loader, strict = FileSystemLoader(_TEMPLATES), StrictUndefined
     pages = Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     absent: Record = {"head": None, "evidence": (), "figures": {}}
-    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": stylesheet()}
-    script = (_TEMPLATES / "report.js").read_text(encoding="utf-8")
-    return pages.get_template("report.html.jinja").render(absent | parts, script=script)
+    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": style, "script": script}
+    return pages.get_template("report.html.jinja").render(absent | parts)
 
 
 def encoded(run: RunFolder, name: str) -> Drawn:
@@ -69,11 +72,3 @@ def encoded(run: RunFolder, name: str) -> Drawn:
     drawn = draw(name, run)
     svg = "" if drawn.figure is None else to_svg(drawn.figure, name, drawn.title)
     return replace(drawn, svg=svg, figure=None)
-
-
-def stylesheet() -> str:
-    """Return the page's style with the tones of the figures as variables, for light and dark pages."""
-    light = "".join(f"{t.variable}:{t};" for t in Tone)
-    dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)
-    text = (_TEMPLATES / "report.css").read_text(encoding="utf-8")
-    return text.replace("/* light tones */", light).replace("/* dark tones */", dark)

@@ -97,11 +97,6 @@ def readable_unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-def axis_label(channel: str, unit: str) -> str:
-    """Return a channel's name with its unit of measure."""
-    return f"{words(channel)} ({readable_unit(unit)})" if readable_unit(unit) else words(channel)
-
-
 def squared(unit: str) -> str:
     """Return the square of a unit of measure, such as ``(rad/s)²``."""
     if unit in ("", "1"):

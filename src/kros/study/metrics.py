@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from ..core import Record, load_artifact, plain
 from ..evaluate.over_units import interval_rows
-from ..observer import Observer
 from ..observer.sensor_gains import sensor_gains
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel
@@ -136,7 +135,7 @@ def _observers(context: Context) -> Record:
 
 def _deployment(context: Context) -> Record:
     """Return what the deployed observer reads, estimates and needs of its sensors."""
-    observer = Observer.load(context.store.path("observers", "deployed.json"))
+    observer = context.deployed
     measured, sizes = observer.outputs, observer.about["largest_in_training"]
     return {
         "measured": measured,

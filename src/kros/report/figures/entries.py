@@ -10,6 +10,7 @@ from ...uncertainty import Form
 from ...uncertainty.unit_residuals import UnitResiduals
 from ..canvas import Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note, set_titles
 from ..names import model_label, shorten, words
+from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
 
 Names = tuple[Sequence[str], Sequence[str]]
@@ -32,9 +33,7 @@ def differing(residuals: UnitResiduals) -> list[int]:
     return [k for k in residuals.rows(inside=True) if residuals.unit_ids[k] != residuals.nominal_id]
 
 
-def entries_figure(
-    residuals_of: Mapping[str, UnitResiduals], names: Mapping[str, Names], alarm: str | None = None
-) -> Figure:
+def entries_figure(run: RunFolder, residuals_of: Mapping[str, UnitResiduals], alarm: str | None = None) -> Figure:
     """Draw entries of all units with their bound and its fit, models side by side or one below the other."""
     sizes = {
         name: (min(r.largest.shape[1], DRAWING.states), min(r.largest.shape[2], DRAWING.states))
@@ -49,9 +48,10 @@ def entries_figure(
     top, left = 0, 0
     for name, residuals in residuals_of.items():
         p, m = sizes[name]
-        _draw_block(axes[top : top + p, left : left + m], residuals, names[name], model_label(name), alarm)
+        names = entry_names(residuals.form, run.models[name])
+        _draw_block(axes[top : top + p, left : left + m], residuals, names, model_label(name), alarm)
         left, top = (left + m, top) if together else (left, top + p)
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure
 
 

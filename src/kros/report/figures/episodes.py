@@ -135,7 +135,7 @@ def blocks_figure(
         label_below(panels[-1, :3], "time (s)")
         set_titles(panels[0, [0, 2, 3]], (block.title, "error", "PSD of the error"))
     figure.align_ylabels(axes[:, 0])
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure
 
 

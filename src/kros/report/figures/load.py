@@ -40,7 +40,7 @@ def load_torque(run: RunFolder) -> Captioned:
         frequency_axis(spectrum, freqs)
     set_titles(axes[0], ("in units of current", "PSD of load and errors, 1/Hz"))
     axes[-1, 0].set_xlabel("time (s)")
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     unit, condition, _ = content["shown"]
     parts = [f"{r['observer']} {r['error_percent']:.0f} % of the load" for r in content["rows"]]
     text = f"Unit {unit}{in_condition(condition)}. Errors below 5 Hz over all units whose load was not known: "

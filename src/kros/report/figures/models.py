@@ -50,7 +50,7 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
         panel.set_ylabel("" if j else short(models.lifting.names[i]))
     for j, panel in enumerate(axes[0]):
         panel.set_title(f"{words(models.inputs[j // 2])}:\n{'phase (°)' if j % 2 else 'magnitude (dB)'}")
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure
 
 
@@ -67,7 +67,7 @@ def step_figure(models: ModelSet) -> Figure:
     set_titles(axes[0], (f"{short(name)}:\nstep of 1 {units.get(name, '')}" for name in inputs))
     label_rows(axes[:, 0], channels)
     label_below(axes[-1], "time (s)")
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure
 
 
@@ -95,5 +95,5 @@ def residuals_figure(
         panels[0].set_ylabel(short(name))
     set_titles(axes[0], (f"residual with\n{short(name)}" for name in ("itself", *chosen.recorded_inputs)))
     label_below(axes[-1], "lag (samples)")
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure

@@ -54,7 +54,7 @@ def signals(run: RunFolder) -> Captioned:
     label_rows(axes[:, 0], channels)
     label_below(axes[-1], "time (s)")
     figure.align_ylabels(axes[:, 0])
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure, "The same unit in two conditions." if len(shown) == 2 else ""
 
 
@@ -98,7 +98,7 @@ def excitation_figure(population: Population, unit: str | None = None, condition
         frequency_axis(left, freqs)
         frequency_axis(right, freqs)
     set_titles(axes[0], (f"PSD, {len(keys)} episodes of unit {keys[0].unit}", "coherence with states"))
-    legend(figure, axes[0, 1])
+    legend(axes[0, 1])
     return figure
 
 
@@ -121,7 +121,7 @@ def tracking_spectrum(run: RunFolder) -> Captioned:
     panel.set_xlabel("frequency (Hz)")
     unit = next(c.unit for c in run.channels if c.name == spec.measured)
     panel.set_ylabel(f"{spec.measured} error,\nPSD ({squared(unit)}/Hz)")
-    legend(figure, panel)
+    legend(panel)
     text = f"{words(spec.reference)} minus {words(spec.measured)} at the highest speed. Dotted: {frequency:.3g} Hz, "
     return figure, text + f"which is {spec.ratio:g} times the speed, and its multiples."
 

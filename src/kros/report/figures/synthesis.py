@@ -36,7 +36,7 @@ def bode(run: RunFolder) -> Captioned:
         panel.axhline(0, color=Tone.SOFT, lw=DRAWING.thin)
         frequency_axis(panel, freqs)
         panel.set_title(model_label(name))
-    legend(figure, max(axes[0], key=lambda panel: len(panel.lines)), 4)
+    legend(max(axes[0], key=lambda panel: len(panel.lines)), 4)
     axes[0, 0].set_ylabel("largest singular value (dB)")
     return figure, "Every signal over its largest value. K maps the innovation to the correction."
 

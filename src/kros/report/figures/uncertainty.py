@@ -27,7 +27,7 @@ from ..canvas import (
 from ..names import model_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, HUES, Tone
-from .entries import differing, entries_figure, entry_names
+from .entries import differing, entries_figure
 
 FORM_TONES = {
     Form.ADDITIVE: Tone.INK,
@@ -55,7 +55,7 @@ def forms(run: RunFolder) -> Captioned:
             panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form])
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
-    legend(figure, axes[0, 0], 3)
+    legend(axes[0, 0], 3)
     return figure, text
 
 
@@ -109,7 +109,7 @@ def uncertain_figure(model: UncertainModel) -> Figure:
     figure, axes = grid(1, 3, sharex=True)
     _draw_weights(axes[0], model)
     draw_forms(axes[0, 2], model)
-    legend(figure, axes[0, 2], 3)
+    legend(axes[0, 2], 3)
     set_titles(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"))
     return figure
 
@@ -160,22 +160,20 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
 def weights_entrywise(run: RunFolder) -> Captioned:
     """Draw residuals entry by entry with their fitted weights (the paper's Figure 8 as published)."""
     chosen = run.unit_residuals
-    names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
     first = next(iter(chosen.values()))
     text = f"Magnitudes of the entries of all {words(first.form.value)} residuals relative to unit {first.nominal_id}. "
     excess = [f"{number(r.entry_excess)} ({model_label(n)})" for n, r in chosen.items() if r.entry_excess > 1]
     text += "Bounds of entries do not bound a full perturbation"
     text += f": σmax(W⁻¹E) reaches {' and '.join(excess)}." if excess else "."
-    return entries_figure(chosen, names), text
+    return entries_figure(run, chosen), text
 
 
 def outlier_residuals(run: RunFolder) -> Captioned:
     """Draw the residual of the highest-scoring unit beside those of the others (the paper's Figure 15)."""
     first = next(iter(run.others.values()))
     unit = first.outside[0]
-    names = {n: entry_names(r.form, run.models[n]) for n, r in run.others.items()}
     text = f"Entries of the {words(first.form.value)} residuals relative to unit {first.nominal_id}, weights fitted to "
-    return entries_figure(run.others, names, alarm=unit), text + f"all units but {unit}."
+    return entries_figure(run, run.others, alarm=unit), text + f"all units but {unit}."
 
 
 def sets_figure(models: UncertainModels, model: str | None = None) -> Figure:

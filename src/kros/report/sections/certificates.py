@@ -9,7 +9,7 @@ from ...core.linalg import radius_text
 from ...design.task import split_name
 from ..content import Column, Row, Section, Table, build
 from ..facts import Facts
-from ..names import axis_label, label_of, minus, observer_label
+from ..names import label_of, minus, observer_label
 
 _TEXT = (
     "For the set of plants: a bound on the H2 norm of the error for every plant between the weights, and a lower bound "
@@ -65,7 +65,7 @@ def _table(facts: Facts) -> Table | None:
         Column("gap (%)", "gap_percent", "set of plants"),
     ]
     for channel in dict.fromkeys(c for row in rows for c in row.get("set_bound") or {} if c not in facts.measured):
-        group = f"recorded signals: {axis_label(channel, facts.unit(channel))}"
+        group = f"recorded signals: {facts.axis(channel)}"
         columns += [Column("bound", ("bound", channel), group), Column("worst RMS error", ("worst", channel), group)]
     columns.append(Column("gain at most", "relift_gain", "at run time"))
     return build("Certificates of all observers", columns, rows, facts.label, sortable=True)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from ...core import ByName
 from ..content import Column, Row, Section, Table, build
 from ..facts import Facts
-from ..names import axis_label, joined, label_of, number, words
+from ..names import joined, label_of, number, words
 
 _ERRORS = {
     "noise": "white noise, standard deviation",
@@ -48,7 +48,7 @@ def _needed(facts: Facts, entry: ByName) -> Table | None:
         share = entry["largest"][channel] / 100
         for kind, gains in kinds.items():
             sizes = {state: share / gain for state, gain in gains.items() if gain}
-            rows.append({"error": f"{axis_label(channel, facts.unit(channel))}: {_ERRORS[kind]}", **sizes})
+            rows.append({"error": f"{facts.axis(channel)}: {_ERRORS[kind]}", **sizes})
     columns = [Column(words(state), state) for state in entry.get("estimates", ()) if state not in entry["measured"]]
     return build(
         "Error of a measurement that costs 1 % of the largest value of an estimate", [Column("error"), *columns], rows
@@ -61,9 +61,9 @@ def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
 
     def named(names: Sequence[str]) -> str:
         sizes = {n: f" up to {number(largest[n])}" if n in largest else "" for n in names}
-        return joined([axis_label(n, facts.unit(n)) + sizes[n] for n in names])
+        return joined([facts.axis(n) + sizes[n] for n in names])
 
-    hidden = [axis_label(n, facts.unit(n)) for n in entry["estimates"] if n not in entry["measured"]]
+    hidden = [facts.axis(n) for n in entry["estimates"] if n not in entry["measured"]]
     delay = f"a measurement delay of {late} samples is assumed" if late else "no measurement delay is assumed"
     sensors = entry["sensor"].items()
     assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in sensor.items() if v) for n, sensor in sensors}
@@ -72,7 +72,7 @@ def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
         ("Estimates", [f"{joined(hidden)}, for the next sample; {delay}."]),
         ("Rate", [f"One step every {dt:g} s ({1 / dt:g} Hz), {entry['states']} states."]),
         ("Parameters", _parameters(entry["parameters"], bool(facts.get("calibration")))),
-        ("Sensor", [f"Assumed for {axis_label(n, facts.unit(n))}: {text}." for n, text in assumed.items() if text]),
+        ("Sensor", [f"Assumed for {facts.axis(n)}: {text}." for n, text in assumed.items() if text]),
     ]
 
 

@@ -16,17 +16,16 @@ from ...identify import ModelSet
 from ...identify.calibration import Values, training_keys, unit_parameters
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
-from ...observer import Observer, run_innovations, screened
+from ...observer import run_innovations, screened
 from ...report.unit_verdicts import Rows, with_verdict
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import Evidence, Recorded, score_row
 from ...uncertainty.outliers.score import FEWEST_UNITS, Status
-from ..config import Stage
 from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
-from .field import DEPLOYED, FieldRecordings, check_channels, hidden_states, open_data, status_counts
+from ..engine.store import DEPLOYED
+from .field import STAGES, FieldRecordings, check_channels, hidden_states, open_data, status_counts
 
-STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)
 Judged = list[tuple[Array, Flags]]  # innovations, and which samples are judged
 
 
@@ -50,7 +49,7 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     store = context.store
     matches = (re.fullmatch("outliers/([^/]+)/outlier_model.json", name) for name in sorted(store.files()))
     names = [match[1] for match in matches if match]
-    observer = Observer.load(store.path(*DEPLOYED)) if store.holds(*DEPLOYED) else None
+    observer = context.deployed if store.holds(*DEPLOYED) else None
     population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
     watched = Rows()

@@ -31,15 +31,16 @@ from ...identify.calibration import Texts, Values, unit_values
 from ...observer import Observer, SampleStatus
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
-from ..config import StudyConfig, validate_config
+from ..config import Stage, StudyConfig, validate_config
 from ..engine.context import Context
+from ..engine.store import DEPLOYED
 from ..stages.learning import ARRAYS
 from ..stages.load import LOAD
 
 log = logging.getLogger(__name__)
 # Episode, first sample, estimates and the tracked parameter, bits, what was recorded: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits, Array]
-DEPLOYED = ("observers", "deployed.json")
+STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)  # behind observers and scores
 _BLOCK = 20_000  # samples of an episode that are run at once
 _PHASES = 24  # values that are tried, around the circle
 _BATCH = 20  # shorter episodes that run side by side
@@ -109,10 +110,9 @@ def load_observer(context: Context, name: str = "deployed") -> Observer:
             f"Run {store.folder}: has no observer {name!r}{did_you_mean(name, known) or ';'} known are "
             f"{', '.join(known)}."
         )
-    chosen = Observer.load(store.path(*known[name]))
+    chosen, about = Observer.load(store.path(*known[name])), context.deployed.about
     if chosen.about:
         return chosen
-    about = Observer.load(store.path(*DEPLOYED)).about
     return replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
 
 

@@ -6,11 +6,8 @@ from pathlib import Path
 
 from ...core import read_json
 from ...evaluate.closed_loop import Controller, LoopResult, close_loop
-from ..config import Stage
 from ..engine.context import open_finished
-from .field import load_observer
-
-STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)
+from .field import STAGES, load_observer
 
 
 def judge_controller(run: Path, file: Path, observer: str = "deployed") -> LoopResult:

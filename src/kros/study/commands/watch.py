@@ -18,7 +18,8 @@ from ...report.unit_verdicts import worst
 from ..engine.context import Context, open_finished
 from ..engine.lock import locked
 from ..engine.store import Store, load_run
-from .check import STAGES, verdicts
+from .check import verdicts
+from .field import STAGES
 
 Waiting = dict[Path, Path]  # recordings, a file or a folder of Parquet, by where their results will be
 

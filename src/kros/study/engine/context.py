@@ -19,10 +19,11 @@ from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...identify.survey import RecordingFacts
 from ...lifting import Lifting
+from ...observer import Observer
 from ...uncertainty import UncertainModels
 from ..config import Stage, StudyConfig
 from .lock import locked
-from .store import METRICS, STUDY, Store, code_key, load_run
+from .store import DEPLOYED, METRICS, STUDY, Store, code_key, load_run
 
 
 @frozen
@@ -79,6 +80,11 @@ class Context:
     def observers_record(self) -> Record:
         """What the synthesize stage left beside its observers: names, facts, and which is deployed."""
         return load_artifact(self.store.path("observers"), "observers")[0]
+
+    @cached_property
+    def deployed(self) -> Observer:
+        """The deployed observer."""
+        return Observer.load(self.store.path(*DEPLOYED))
 
     @cached_property
     def evaluation(self) -> Record:

@@ -31,6 +31,7 @@ from .lock import locked
 log = logging.getLogger(__name__)
 
 STORE = "store"
+DEPLOYED = ("observers", "deployed.json")
 STUDY, METRICS = "study.json", "metrics.json"  # of a run, and of no stage
 
 

@@ -23,7 +23,6 @@ from ...evaluate.held_out import HeldOut
 from ...evaluate.over_units import fewest_units, next_unit_bound
 from ...identify.calibration import Values, unit_parameters
 from ...identify.identified import recordings_of, recordings_path
-from ...observer import Observer
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
 from .evaluate import band_hz, estimation, outcomes
@@ -148,7 +147,7 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
             failed[unit] = str(error)
     if keys := tuple(k for k in test if k.unit in known):
         episodes = HeldOut(whole, keys, known, sensor=context.config.sensor, band_hz=band_hz(context))
-        (outcome,) = episodes.observers([Observer.load(context.store.path("observers", "deployed.json"))])
+        (outcome,) = episodes.observers([context.deployed])
         rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"))
     lost = dict.fromkeys((k.unit, k.condition) for k in test if k.unit in failed)
     base = {"observer": deployed, "role": "reserve"} | dict.fromkeys(_MEASURES, float("inf"))

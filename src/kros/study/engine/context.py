@@ -128,7 +128,9 @@ def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str]) -
     """Run a step, or find it done."""
     store, digest, progress = context.store, digests[step.stage], context.work.progress
     if (artefact := store.stored(digest)) is not None:
-        _outdate(context, digests)
+        known = store.manifest.get(step.stage)
+        if known is None or known.digest != digest:
+            _outdate(context, digests)
         store.add(step.stage, artefact)
         progress.finish(step.stage, artefact.seconds, skipped=True)
         return

@@ -5,9 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import field, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -141,7 +140,7 @@ class FieldRecordings:
     observer: Observer
     population: Population
     values: Values
-    sources: Mapping[str, str] = field(default_factory=dict)
+    sources: dict[str, str] = field(default_factory=dict)
     name: str | None = None  # of the parameter that a phase-locked loop follows
 
     @classmethod
@@ -158,12 +157,13 @@ class FieldRecordings:
         chosen = parse_given(given, population.unit_ids, known)
         home = context.facts.identify_on
         values, sources, reasons = unit_values(population, context.calibration, home, chosen)
-        return cls(observer, population, values, sources, track)._settled(reasons)
+        recordings = cls(observer, population, values, sources, track)
+        recordings._settle(reasons)
+        return recordings
 
-    def _settled(self, reasons: Texts) -> FieldRecordings:
-        """Return the same with all parameters that the observer needs; one that is followed begins anywhere."""
-        values, sources = {unit: dict(known) for unit, known in self.values.items()}, dict(self.sources)
-        for unit, known in values.items():
+    def _settle(self, reasons: Texts) -> None:
+        """Refuse units without a parameter that the observer needs; one that is followed begins anywhere."""
+        for unit, known in self.values.items():
             missing = [name for name in self.observer.lifting.parameters if name not in known]
             if set(missing) - {self.name}:
                 reason, first = reasons.get(unit, "it was not calibrated."), missing[0]
@@ -173,9 +173,8 @@ class FieldRecordings:
                 )
             if self.name is not None:
                 known[self.name] = self._start(unit, self.name) if missing else known[self.name]
-                start = "of the smallest innovation" if missing else f"that is {sources.get(unit)}"
-                sources[unit] = f"tracked from the value {start}"
-        return replace(self, values=values, sources=sources)
+                start = "of the smallest innovation" if missing else f"that is {self.sources.get(unit)}"
+                self.sources[unit] = f"tracked from the value {start}"
 
     def _start(self, unit: str, name: str) -> float:
         """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
@@ -189,13 +188,9 @@ class FieldRecordings:
         coarse = least_innovation(*signals, np.arange(_PHASES) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
-    @cached_property
-    def _parameters(self) -> Values:
-        return {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
-
     def arriving(self, key: EpisodeKey) -> Arriving:
         """Read one episode as it arrives at the observer."""
-        return arriving(self.observer, self.population, {key: self.population.read(key)}, self._parameters)
+        return arriving(self.observer, self.population, {key: self.population.read(key)}, self.values)
 
     def estimates(self) -> Iterator[Estimated]:
         """Run the observer over all episodes, block by block."""
@@ -210,7 +205,7 @@ class FieldRecordings:
         before = np.empty((0, len(self.population.channels)))
         for block in self.population.blocks(key, _BLOCK):
             values, lead = np.concatenate([before, block]), len(before)
-            arrived = arriving(observer, self.population, {key: values}, self._parameters)
+            arrived = arriving(observer, self.population, {key: values}, self.values)
             course = course or Course(observer, 1, arrived.parameters, loop)
             run = course.take(arrived.y[lead:], arrived.u[lead:])
             columns = run.estimates[:, 0, :n]

@@ -66,10 +66,9 @@ def interval_rows(rows: Sequence[ByName]) -> list[Record]:
         errors.setdefault(tuple(row[name] for name in _CELL), {})[row["unit"]] = row["error_percent"]
     intervals = []
     for cell, by_unit in errors.items():
-        values = [by_unit[unit] for unit in sorted(by_unit)]
-        if len(values) > 2 and all(value is not None and np.isfinite(value) for value in values):
-            lower, upper = unit_interval(values)
-            interval = [float(lower), float(upper)]
+        values = np.array([by_unit[unit] for unit in sorted(by_unit)], dtype=float)  # unknown is NaN
+        if len(values) > 2 and np.isfinite(values).all():
+            interval = [float(end) for end in unit_interval(values)]
             intervals.append({**dict(zip(_CELL, cell, strict=True)), "role": "off_nominal", "interval": interval})
     return intervals
 

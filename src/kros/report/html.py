@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..core import ByName, Record, write_bytes
+from ..core import ByName, Record, read_json, write_bytes
 from .content import Section
 from .facts import Facts
 from .figures import Drawn, draw
@@ -31,25 +31,20 @@ def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = 
 
     `mapped` maps the drawing of a figure over their names, in order, for example in several processes.
     """
-    path = out if out is not None else run / "report.html"
-    write_bytes(path, page(RunFolder(run), metrics, mapped).encode())
-    return path
-
-
-def page(run: RunFolder, metrics: ByName, mapped: Mapped = map) -> str:
-    """Return the report as HTML."""
-    facts = Facts(metrics)
+    facts, path = Facts(metrics), out or run / "report.html"
     parts = [[s for make in makers if (s := make(facts)) is not None] for makers in (FIRST, EVIDENCE)]
     names = [section.figure for part in parts for section in part if section.figure]
-    figures = {drawn.name: drawn for drawn in mapped(partial(encoded, RunFolder(run.folder)), names)}
+    figures = {drawn.name: drawn for drawn in mapped(partial(encoded, RunFolder(run)), names)}
     for drawn in figures.values():
         if drawn.reason:
             log.info("figure %s: left out, %s", drawn.name, drawn.reason)
     aside = len(facts.set_aside)
     count = f"{facts.study['units']} units" + (f" and {aside} set aside" if aside else "")
     conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
-    name, subtitle = run.study.get("name", run.folder.name), " · ".join([count, *conditions])
-    return filled(name, subtitle, parts[0], evidence=parts[1], figures=figures, head=judge(facts))
+    name, subtitle = read_json(run / "study.json").get("name", run.name), " · ".join([count, *conditions])
+    text = filled(name, subtitle, parts[0], evidence=parts[1], figures=figures, head=judge(facts))
+    write_bytes(path, text.encode())
+    return path
 
 
 def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) -> str:

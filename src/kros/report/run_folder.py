@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from ..core import AnyArray, Names, Record, frozen, load_artifact, read_json
+from ..core import AnyArray, Names, Record, frozen, load_artifact
 from ..core.arrays import T
 from ..data.population import Channel, Channels, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
@@ -63,11 +63,6 @@ class RunFolder:
     def has(self, name: str) -> bool:
         """Tell whether a file belongs to the run."""
         return name in self.files
-
-    @cached_property
-    def study(self) -> Record:
-        """The study with all settings."""
-        return read_json(self.folder / "study.json")
 
     @cached_property
     def facts(self) -> RecordingFacts:

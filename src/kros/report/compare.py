@@ -8,7 +8,7 @@ from typing import Any
 from ..core import ByName, Record
 from .content import Column, Section, build
 from .facts import Facts
-from .names import number
+from .names import number, words
 from .verdict import judge
 
 _WORDS = ("settings", "data", "deployed")  # topics whose values are texts
@@ -20,6 +20,8 @@ TITLES = {
     "weights": "Uncertain models",
     "certificates": "Certificates, bounds in percent of the largest value",
 }
+_OF_MODELS = {"form": "form", "nominal": "nominal", "peak_db": "peak (dB)", "weight": "weight"}
+_OF_OBSERVERS = {"set_bound_percent": "bound", "worst_case_h2": "worst-case H2", "relift_gain": "gain at run time"}
 
 
 def comparison(runs: Mapping[str, tuple[ByName, Facts]]) -> dict[str, dict[str, list[Any]]]:
@@ -75,10 +77,15 @@ def texts(content: ByName) -> Record:
     return {name: str(value) for name, value in flat(content)}
 
 
-def of_each(entries: Mapping[str, ByName], *keys: str) -> Record:
-    """Return some entries of all models, or all observers, by their names in the metrics."""
-    every = ((name, *item) for name, entry in entries.items() for item in flat(entry))
-    return {f"{name}: {key}": value for name, key, value in every if key.startswith(keys)}
+def of_each(entries: Mapping[str, ByName], labels: ByName) -> Record:
+    """Return some entries of all models, or all observers, by labels of their names in the metrics."""
+    rows = Record()
+    for name, entry in entries.items():
+        for key, value in flat(entry):
+            first, *rest = key.split(".")
+            if first in labels:
+                rows[f"{name}: {', '.join([labels[first], *map(words, rest)])}"] = value
+    return rows
 
 
 def data(facts: Facts) -> Record:
@@ -114,14 +121,14 @@ def errors(facts: Facts) -> Record:
 
 def weights(facts: Facts) -> Record:
     """Return form, nominal and weights of every kind of model, and the units flagged."""
-    rows = of_each(facts.get("uncertainty"), "form", "nominal", "peak_db", "weight")
+    rows = of_each(facts.get("uncertainty"), _OF_MODELS)
     flagged = [f"{r['unit']} ({r['condition']})" for r in facts.get("outliers") if r["outlier"]]
     return rows | ({"units flagged": ", ".join(flagged) or "none"} if rows else {})
 
 
 def certificates(facts: Facts) -> Record:
     """Return bounds for recorded signals, worst-case H2 and gains at run time of all observers."""
-    return of_each(facts.observers, "set_bound_percent", "worst_case_h2", "relift_gain")
+    return of_each(facts.observers, _OF_OBSERVERS)
 
 
 def lines(section: Section) -> list[str]:

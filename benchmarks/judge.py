@@ -278,10 +278,11 @@ def true_row(
         return {}
     at, rows = population.true_states.index(state), list(chosen)
     dt = population.sample_period_s
-    own = true_errors(estimate[:, rows], batch.truths[:, rows][..., [at]], (state,), batch.lengths[rows], dt)
-    recorded = true_errors(batch.states[:, rows], batch.truths[:, rows][..., [at]], (state,), batch.lengths[rows], dt)
-    found = {"true_error_percent": own.error_percent, "true_lag_s": own.lag_s}
-    found |= {"recorded_true_error_percent": recorded.error_percent, "recorded_true_lag_s": recorded.lag_s}
+    truth = batch.truths[:, rows][..., [at]], batch.lengths[rows], dt
+    found = dict[str, np.ndarray]()
+    for prefix, signals in (("", estimate), ("recorded_", batch.states)):
+        errors = true_errors(signals[:, rows][..., [state]], *truth)
+        found |= {f"{prefix}{name}": errors[name] for name in ("true_error_percent", "true_lag_s")}
     return {what: float(values.mean()) for what, values in found.items()}
 
 

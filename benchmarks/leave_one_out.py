@@ -34,7 +34,8 @@ from kros.data import write_parquet
 from kros.design.task import split_name
 from kros.evaluate import unit_interval
 from kros.plants import HarmonicDrivePopulation
-from kros.report.error_tables import ErrorCell, ErrorTable, tables_of
+from kros.report.facts import ErrorCell, ErrorTable
+from kros.report.facts import Facts as Metrics
 from kros.report.names import label_of, minus, number
 from kros.study import load_config
 from kros.study.config import Stage
@@ -120,10 +121,13 @@ def left_out_tables(rows: Sequence[Mapping[str, Any]], home: str) -> list[ErrorT
     grouped: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for row in rows:
         grouped.setdefault((row["observer"], row["condition"], row["channel"]), []).append(row)
-    errors = {key: [row["error_percent"] for row in group] for key, group in grouped.items()}
-    intervals = {key: unit_interval(e) for key, e in errors.items() if len(e) > 1 and None not in e}
+    intervals = []
+    for group in grouped.values():
+        errors = [row["error_percent"] for row in group]
+        if len(errors) > 1 and None not in errors:
+            intervals.append({**group[0], "interval": unit_interval(errors)})
     tables = []
-    for table in tables_of(rows, home, intervals):
+    for table in Metrics({"study": {"identify_on": home}}).tables_of(rows, intervals):
         cells = {
             name: {
                 c: LeftOutCell(
@@ -174,7 +178,7 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
 
 def show(table: ErrorTable, facts: Facts, folds: int) -> None:
     """Print one condition."""
-    channels = [c for c in HIDDEN if c in table.channels]
+    channels = [c for c in HIDDEN if any(c in cells for cells in table.cells.values())]
     say(
         f"\n{table.condition:31s} {'':>5s} {'certified':>11s} "
         + " ".join(f"{f'{c}, % of the largest value':>45s}" for c in channels)

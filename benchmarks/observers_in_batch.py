@@ -19,7 +19,7 @@ import numpy as np
 
 from kros.core.lti import StateSpace, gain
 from kros.data import EpisodeBatch, EpisodeKey
-from kros.evaluate.errors import summarise
+from kros.evaluate.errors import errors_of
 from kros.lifting import Lifting
 from kros.observer import (
     Observer,
@@ -84,7 +84,11 @@ def main() -> None:
     timed("learned estimator", lambda: every(lambda block: moments.estimator().run(block.y, block.u, block.phase)))
     estimates = 2 * sum(COUNTS) + 3
     made = [run_observers([observer(LINEAR, 0)] * TOGETHER, block.y, block.u) for block in blocks]
-    summaries = partial(every, lambda block: summarise(made[blocks.index(block)], block.states, block.lengths, DT))
+    band = 40.0, 60.0
+    summaries = partial(
+        every,
+        lambda block: [errors_of(x, block.states, block.lengths, DT, band) for x in made[blocks.index(block)]],
+    )
     timed(f"errors and spectra of {estimates} estimates", summaries, estimates / TOGETHER)
     sys.stdout.write(f"{'all of the above':58s} {sum(found.values()):7.2f} s\n\nnot part of a study:\n")
     short, block = min(10_000, options.samples), blocks[0]

@@ -31,7 +31,7 @@ from kros.observer.screen import screened
 from kros.observer.simulate import Course
 from kros.observer.tracking import PhaseLockedLoop
 from kros.study.config import Stage
-from kros.study.engine.store import open_finished
+from kros.study.engine.context import open_finished
 from kros.study.stages.learning import open_source
 
 TURN = 2 * np.pi
@@ -70,7 +70,8 @@ def main() -> None:
 
 def read(run: Path) -> tuple[dict[str, tuple[Observer, str | None]], HeldOut]:
     """Return the observers of a run with variants of the deployed one, and its held-out recordings."""
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
+        config, store = context.config, context.store
         paths = sorted(p for p in store.path("observers").glob("*/*.json"))
         kinds: dict[str, tuple[Observer, str | None]] = {
             f"{p.parent.name}/{p.stem}": (Observer.load(p), None) for p in paths
@@ -331,7 +332,7 @@ def clock(observer: Observer, track: str | None, data: HeldOut, given: argparse.
         np.ascontiguousarray(data.y[:, 0]),
         np.ascontiguousarray(data.u[:, 0]),
     )
-    readme = c_files(observer, Source.of(observer, "observer", "double", track))["README.md"]
+    readme = c_files(Source.of(observer, "observer", "double", track))["README.md"]
     operations = int(next(row for row in readme.splitlines() if row.startswith("| multiplications")).split("|")[2])
     context, rows = (
         Source.of(observer, "observer", "double").context(),

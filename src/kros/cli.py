@@ -160,9 +160,13 @@ def _option(text: str, *names: str, metavar: str | None = None, **rest: Any) -> 
     return typer.Option(*names, metavar=metavar, help=text, **rest)
 
 
+def _argument(metavar: str, text: str | None = None) -> Any:
+    return typer.Argument(metavar=metavar, help=text)
+
+
 Names = list[str] | None
-Run = Annotated[Path, typer.Argument(metavar="RUN")]
-Data = Annotated[Path, typer.Argument(metavar="DATA", help="Recordings like the study's, or a TOML file with [data].")]
+Run = Annotated[Path, _argument("RUN")]
+Data = Annotated[Path, _argument("DATA", "Recordings like the study's, or a TOML file with [data].")]
 Quiet = Annotated[bool, _option("Print JSON and nothing else on standard output.", "--json")]
 Workers = Annotated[int | None, _option("Processes for maps over units; default: one a core.")]
 Overrides = Annotated[Names, _option("Override a key of the study.", "--set", metavar="KEY=VALUE")]
@@ -213,7 +217,7 @@ def main(
 
 @app.command()
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of recordings.")],
+    folder: Annotated[Path, _argument("FOLDER", "Folder of recordings.")],
     measured: Annotated[Names, _option("State that is available at run time; repeatable.", metavar="NAME")] = None,
     input_: Annotated[Names, _option("Input; repeatable.", "--input", metavar="NAME")] = None,
     out: Annotated[Path, _option("New study file.")] = Path("study.toml"),
@@ -250,7 +254,7 @@ def demo(
 
 @app.command()
 def simulate(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the recordings.")],
+    out: Annotated[Path, _argument("OUT", "New folder for the recordings.")],
     plant: Annotated[str, _option("harmonic-drive, pendulum or dc-motor.")] = "harmonic-drive",
     units: Annotated[int, typer.Option(min=1)] = 12,
     episodes: Annotated[int, typer.Option(min=1, max=1000)] = 10,
@@ -268,7 +272,7 @@ def simulate(
 
 @app.command()
 def run(
-    study: Annotated[Path, typer.Argument(metavar="STUDY.toml")],
+    study: Annotated[Path, _argument("STUDY.toml")],
     out: Annotated[Path | None, _option("Run folder; default: runs/<study> beside the study file.")] = None,
     until: Annotated[str, _option("Last stage, such as identify; an unknown one lists all.")] = "report",
     set_: Overrides = None,
@@ -286,7 +290,7 @@ def run(
 
 
 def _finish(result: Any, quiet: bool) -> None:
-    _show(quiet, result.metrics, [] if quiet else result.summary().splitlines()[1:])
+    _show(quiet, result.metrics, result.summary().splitlines()[1:])
 
 
 @app.command()
@@ -327,7 +331,7 @@ def loop(
 
 @app.command()
 def watch(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where recordings arrive.")],
+    folder: Annotated[Path, _argument("FOLDER", "Where recordings arrive.")],
     run_folder: Run,
     out: Annotated[Path | None, _option("Folder of results; default: FOLDER-results.")] = None,
     every: Annotated[float, _option("Time between two looks; a file that grows is waited for.", metavar="S")] = 2.0,
@@ -344,7 +348,7 @@ def watch(
 def estimate(
     run_folder: Run,
     data: Data,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="New file, .parquet or .csv")],
+    out: Annotated[Path, _argument("OUT", "New file, .parquet or .csv")],
     parameter: Annotated[Names, _option("Of a unit, as its phase; repeatable.", metavar="UNIT.NAME=VALUE")] = None,
     track: Track = None,
     plot: Annotated[Path | None, _option("Draw the first episode, .png", metavar="FILE")] = None,
@@ -358,7 +362,7 @@ def estimate(
 @export.command("c")
 def export_c(
     run_folder: Run,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the source.")],
+    out: Annotated[Path, _argument("OUT", "New folder for the source.")],
     name: Prefix = None,
     precision: Precision = "double",
     observer: ObserverName = "deployed",
@@ -374,7 +378,7 @@ def export_c(
 @export.command("fmu")
 def export_fmu(
     run_folder: Run,
-    out: Annotated[Path, typer.Argument(metavar="OUT.fmu", help="New file.")],
+    out: Annotated[Path, _argument("OUT.fmu", "New file.")],
     fmi: Annotated[int, _option("Version of the standard, 2 or 3")] = 2,
     name: Prefix = None,
     precision: Precision = "double",
@@ -406,7 +410,7 @@ def figures(run_folder: Run, out: Path) -> None:
 
 @app.command()
 def compare(
-    run_folders: Annotated[list[Path], typer.Argument(metavar="RUN RUN...")],
+    run_folders: Annotated[list[Path], _argument("RUN RUN...")],
     out: Annotated[Path | None, _option("Write an HTML page.", metavar="FILE")] = None,
     quiet: Quiet = False,
 ) -> None:

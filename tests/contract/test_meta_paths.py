@@ -146,7 +146,7 @@ def test_places_of_changes_exist(name: str, file: str) -> None:
 
 
 def test_every_change_has_a_place() -> None:
-    assert [name for name, _ in places()] == ["WeightSettings", "initial", "begin", "_channel", "METHODS"]
+    assert [name for name, _ in places()] == ["WeightSettings", "initial", "begin", "_table", "METHODS"]
 
 
 def test_the_order_of_weights_has_one_default() -> None:

@@ -17,7 +17,6 @@ from kros.identify.calibration import calibration_keys, segments_of, unit_parame
 from kros.observer import Observer, run_observer
 from kros.study import load_config
 from kros.study import run as run_study
-from kros.study.commands.field import load_calibration
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.store import Store
@@ -150,13 +149,13 @@ def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     run_study(config, fold, until=Stage.CALIBRATE)
     run_study(load_config(study(tmp_path, tmp_path / "drives")), whole, until=Stage.CALIBRATE)
     contexts = [Context(config, Store(folder), Work()) for folder in (whole, fold)]
-    unit, calibration = contexts[0].population.select(["001003"]), load_calibration(Store(fold))
+    unit, calibration = contexts[0].population.select(["001003"]), contexts[1].calibration
     prefer = contexts[1].facts.identify_on
     phases = unit_parameters(unit, calibration, prefer, contexts[0].facts)
     assert phases == unit_parameters(unit, calibration, prefer)
     segments = segments_of((unit, calibration_keys(contexts[0].facts, "001003"), calibration.spec))
     assert phases == {"001003": {"phase": calibration.calibrate(segments, "001003").phase_rad}}
-    assert "001003" not in load_calibration(Store(fold)).units
+    assert "001003" not in calibration.units
     made = without(contexts[1], ["001002"])
     assert made.data.exclude == ("001003", "001002")
     assert made.data.source == tmp_path / "drives"

@@ -23,7 +23,7 @@ from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace
 from kros.identify import PhaseCalibration, PhaseSpec
 from kros.identify.calibration import UnitPhase
-from kros.report.figures import FIGURES, draw, draw_all
+from kros.report.figures import FIGURES, draw
 from kros.report.figures.entries import entry_names
 from kros.report.figures.recordings import phase_figure
 from kros.report.figures.synthesis import scaled_filter
@@ -158,7 +158,7 @@ def test_page_in_a_browser(page, tmp_path) -> None:
 def test_points_carry_the_names_of_their_units() -> None:
     units = ("000000", "001", HOSTILE, "002")
     phases = {unit: UnitPhase(0.5 * i, -0.9, 0.99, 12) for i, unit in enumerate(units)}
-    svg = to_svg(phase_figure(PhaseCalibration(PhaseSpec(), -0.9, phases)), "phase")
+    svg = to_svg(phase_figure(PhaseCalibration(PhaseSpec(), -0.9, phases), units), "phase", "Phases")
     marks = dict(re.findall(r'<use data-unit="([^"]*)"[^>]* x="([\d.]+)"', svg.replace("\n", " ")))
     order = [unit.replace("<", "&lt;").replace(">", "&gt;") for unit in units]
     assert sorted(marks, key=lambda unit: float(marks[unit])) == order  # the horizontal axis is units in order
@@ -183,7 +183,7 @@ def test_a_part_of_a_run_has_a_report(tmp_path) -> None:
     assert "<figure" not in text
     assert "stopped before an observer was designed" in text
     assert "NOT READY" in text
-    assert all(result.figure is None and result.reason for result in draw_all(RunFolder(tmp_path)))
+    assert all((drawn := draw(name, RunFolder(tmp_path))).figure is None and drawn.reason for name in FIGURES)
     (tmp_path / "evaluation").mkdir()
     (tmp_path / "evaluation" / "evaluation.json").write_text("{")
     (tmp_path / "report.html").unlink()
@@ -194,7 +194,7 @@ def test_a_part_of_a_run_has_a_report(tmp_path) -> None:
 
 def test_figures_as_files_are_the_same_every_time(demo, tmp_path, monkeypatch) -> None:
     few = ("phase", "forms", "observers_in_time")
-    monkeypatch.setattr("kros.report.figures.FIGURES", {name: FIGURES[name] for name in few})
+    monkeypatch.setattr("kros.report.files.FIGURES", {name: FIGURES[name] for name in few})
     files = []
     for folder in (tmp_path / "new" / "a", tmp_path / "new" / "b"):
         names = write_figures(demo, folder)
@@ -318,3 +318,12 @@ def test_what_cannot_be_compared_is_refused(kros, demo, tmp_path):
     shutil.copytree(demo, begun)
     (begun / "metrics.json").unlink()
     assert "has not ended" in kros("compare", demo, begun).stderr
+
+
+def test_a_report_that_was_written_again_does_not_keep_a_run_from_being_read(kros, demo, tmp_path):
+    again = tmp_path / "again"
+    shutil.copytree(demo, again)
+    assert kros("report", again).exit_code == 0
+    assert (again / "report.html").read_bytes() != (demo / "report.html").read_bytes()  # with the time of the report
+    assert kros("list", again).exit_code == 0
+    assert kros("compare", demo, again).exit_code == 0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kros.evaluate.errors import error_percent, error_rms, error_spectrum, summarise
+from kros.evaluate.errors import error_percent, error_rms, error_spectrum, errors_of
 
 DT = 0.01
 
@@ -34,10 +34,10 @@ def test_errors_are_those_of_the_definition(lengths):
     truth, estimate = episodes(lengths)
     rms, percent = by_hand(truth, estimate, lengths)
     counts = np.array(lengths)
-    (found,) = summarise(estimate[None], truth, counts, DT)
-    for values in (found.rms, error_rms(estimate, truth, counts)):
+    found = errors_of(estimate, truth, counts, DT)
+    for values in (found["rms"], error_rms(estimate, truth, counts)):
         np.testing.assert_allclose(values, rms, rtol=1e-12)
-    for values in (found.percent, error_percent(estimate, truth, counts)):
+    for values in (found["error_percent"], error_percent(estimate, truth, counts)):
         np.testing.assert_allclose(values, percent, rtol=1e-12)
 
 
@@ -60,9 +60,10 @@ def test_a_state_at_zero_has_no_percentage(lengths):
 def test_diverged_estimates_are_not_finite_and_nobody_is_warned():
     truth, estimate = episodes((600, 600))
     estimate[100:, 0, 0] = 1e300
-    (found,) = summarise(estimate[None], truth, np.array([600, 600]), DT)
-    assert not np.isfinite(found.rms[0, 0])
-    assert np.isfinite(found.rms[1]).all()
+    found = errors_of(estimate, truth, np.array([600, 600]), DT, (0.0, 1.0))
+    for values in found.values():
+        assert not np.isfinite(values[0, 0])
+        assert np.isfinite(values[1]).all()
 
 
 def periodogram(x):
@@ -78,23 +79,18 @@ def periodogram(x):
     return frequencies / (512 * DT), density
 
 
-def test_spectra_are_those_of_the_definition():
+def test_powers_are_those_of_the_definition_both_ends_of_the_band_included():
     lengths = (1100, 1100, 900, 1100, 1100, 1100, 1100, 1100, 1100)  # more episodes of one length than are done at once
     truth, estimate = episodes(lengths, seed=3)
-    (found,) = summarise(estimate[None], truth, np.array(lengths), DT)
+    band = tuple(np.fft.rfftfreq(512, DT)[[10, 20]])
+    found = errors_of(estimate, truth, np.array(lengths), DT, band)["gearbox_band_power"]
     for b, length in enumerate(lengths):
         for channel in range(2):
-            freqs, density = periodogram((estimate - truth)[:length, b, channel])
-            np.testing.assert_allclose(found.spectra[b, :, channel], density, rtol=1e-9)
-            np.testing.assert_allclose(found.freqs_hz, freqs, rtol=1e-12)
-
-
-def test_band_power_adds_what_is_inside_both_ends_included():
-    truth, estimate = episodes((1024, 1024))
-    (found,) = summarise(estimate[None], truth, np.array([1024, 1024]), DT)
-    low, high = found.freqs_hz[10], found.freqs_hz[20]
-    inside = sum(found.spectra[:, k] for k in range(10, 21)) / (512 * DT)
-    np.testing.assert_allclose(found.band_power((low, high)), inside, rtol=1e-12)
+            error = (estimate - truth)[:length, b, channel]
+            freqs, density = periodogram(error)
+            for actual, expected in zip(error_spectrum(error, DT), (freqs, density), strict=True):
+                np.testing.assert_allclose(actual, expected, rtol=1e-9)
+            assert found[b, channel] == pytest.approx(density[10:21].sum() / (512 * DT), rel=1e-9)
 
 
 def test_short_signals_are_padded_to_the_same_frequencies():

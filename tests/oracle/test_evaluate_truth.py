@@ -37,9 +37,10 @@ def test_what_has_no_delay_is_unknown_and_behind_an_episode_nothing_counts():
     x, y = tone(k, kinds), tone(k - 2.5, kinds)
     y[7, 1], x[:, 2], lengths = np.nan, 4.0, np.array([N, N, N, 2000])
     x[2000:, 3], y[2000:, 3] = 1e6, -1e6
-    found = true_errors(np.stack([-x, y], axis=-1), x[..., None], (1,), lengths, dt=0.01)
-    np.testing.assert_allclose(found.lag_s[:, 0], [0.025, np.nan, np.nan, 0.025], atol=2e-5)
+    found = true_errors(y[..., None], x[..., None], lengths, dt=0.01)
+    np.testing.assert_allclose(found["true_lag_s"][:, 0], [0.025, np.nan, np.nan, 0.025], atol=2e-5)
     error = y[:2000, 3] - x[:2000, 3]
-    assert found.rms[3, 0] == pytest.approx(np.sqrt(np.mean(error**2)))
-    assert found.error_percent[3, 0] == pytest.approx(100 * found.rms[3, 0] / np.abs(x[:2000, 3]).max())
+    assert found["true_rms"][3, 0] == pytest.approx(np.sqrt(np.mean(error**2)))
+    largest = np.abs(x[:2000, 3]).max()
+    assert found["true_error_percent"][3, 0] == pytest.approx(100 * found["true_rms"][3, 0] / largest)
     assert np.isnan(delay_samples(np.exp(-(((k - 2500) / 90.0) ** 2)), np.exp(-(((k - 500) / 90.0) ** 2))))

@@ -6,10 +6,10 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from kros.report.content import Column, build
-from kros.report.error_tables import error_tables
 from kros.report.facts import Facts
 from kros.report.sections.errors import errors
 from kros.report.verdict import Status, judge
@@ -140,25 +140,26 @@ def test_the_best_certified_observer_is_one_that_was_designed() -> None:
 
 def test_tables_leave_out_what_is_not_known() -> None:
     columns = [
-        Column("name", ["a", "b"]),
-        Column("error", [2.0, 1.0], "group", best=True),
-        Column("nothing", [None, float("nan")], "group"),
-        Column("certified", [True, None], "other"),
+        Column("name"),
+        Column("error", group="group", best=True, note="remark"),
+        Column("nothing", 0, "group"),
+        Column("certified", "robust", "other"),
     ]
-    table = build("caption", columns, chosen="b")
+    rows = [{"name": "a", "error": 2.0, 0: None, "robust": True}, {"name": "b", "error": 1.0, 0: np.nan, "remark": "r"}]
+    table = build("caption", columns, rows, chosen="b")
     assert table is not None
     assert list(table.head) == ["name", "error", "certified"]
     assert list(table.groups) == [("", 1), ("group", 1), ("other", 1)]
     assert [[c.text for c in cells] for cells in table.rows] == [["a", "2.00", "yes"], ["b", "1.00", "–"]]
-    assert [cells[1].strong for cells in table.rows] == [False, True]
+    assert [(cells[1].strong, cells[1].note) for cells in table.rows] == [(False, ""), (True, "r")]
     assert list(table.chosen) == [1]
-    assert build("empty", [Column("name", []), Column("x", [])]) is None
-    assert build("unknown", [Column("name", ["a"]), Column("x", [None])]) is None
+    assert build("empty", columns, []) is None
+    assert build("unknown", columns, [{"name": "a", "error": None}]) is None
 
 
 def test_the_mean_is_geometric_and_infinite_where_an_estimate_diverged() -> None:
     rows = [row(NAME, 1.0), row(NAME, 4.0, channel="current"), row("l/h2", None), row("l/h2", 1.0, channel="current")]
-    (table,) = error_tables(metrics(evaluation=rows))
+    (table,) = Facts(metrics(evaluation=rows)).tables
     assert table.mean(NAME, ["velocity", "current"]) == pytest.approx(2.0)
     assert table.mean("l/h2", ["velocity", "current"]) == float("inf")
 

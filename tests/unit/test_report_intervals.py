@@ -4,7 +4,7 @@ import numpy as np
 
 from kros.evaluate import unit_interval
 from kros.evaluate.over_units import interval_rows
-from kros.report.error_tables import error_tables
+from kros.report.facts import Facts
 
 
 def evaluation(units=8, seed=0):
@@ -35,8 +35,8 @@ def test_intervals_of_all_observers_are_those_of_each():
     values = [r["error_percent"] for r in rows if (r["observer"], r["channel"], r["role"]) == ("b", "v", "off_nominal")]
     np.testing.assert_allclose(found["b", "noload", "v"], unit_interval(values))
     metrics = {"study": {"identify_on": "noload"}, "evaluation": rows, "intervals": interval_rows(rows)}
-    cell = error_tables(metrics)[0].cells["b"]["v"]
-    assert cell.interval == found["b", "noload", "v"]
+    cell = Facts(metrics).tables[0].cells["b"]["v"]
+    assert tuple(cell.interval) == found["b", "noload", "v"]
     assert cell.interval[0] < cell.mean < cell.interval[1]
     assert len(found) == 4
 

@@ -39,6 +39,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
             population=population,
             sizes=dict.fromkeys(population.states + population.inputs, 7.0),
         ),
+        uncertain=SimpleNamespace(nominal="001001"),
         store=Store(folder),
     )
 
@@ -61,6 +62,15 @@ def test_a_declared_load_is_found_on_the_other_units(tmp_path: Path) -> None:
             SimpleNamespace(folder=tmp_path, sample_period_s=1e-3, has=lambda name: (tmp_path / name).exists())
         )[1]
     )
+
+
+def test_an_observer_of_the_load_runs_with_the_parameters_of_the_nominal_unit(tmp_path: Path) -> None:
+    study = context(tmp_path, moment=0.2, units=("001002",))
+    study.lifting = Lifting(POPULATION.states, ("sin(100*position + phase)",), ("phase",))
+    study.identified.parameters = {unit: {"phase": 0.5 + i} for i, unit in enumerate(POPULATION.unit_ids)}
+    run_load(study, {})
+    assert Observer.load(tmp_path / "load" / "koopman.json").parameters == {"phase": 0.5}
+    assert Observer.load(tmp_path / "load" / "linear.json").parameters == {}
 
 
 def test_without_a_moment_nothing_is_done(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def test_what_a_stage_drafts_is_at_its_place_and_in_the_store(tmp_path):
     store = written(tmp_path, "one")
     assert (tmp_path / "deep" / "a.txt").read_text() == "one"
     assert store.files() == {"deep/a.txt"}
-    assert store.record("read") == store.stored(digest_of("a"))
+    assert store.manifest.get("read") == store.stored(digest_of("a"))
     assert store.stored(digest_of("b")) is None
 
 
@@ -103,7 +103,7 @@ def test_where_files_cannot_be_linked_they_are_copied_with_their_times(tmp_path,
     store = written(tmp_path, "one")
     file = tmp_path / "deep" / "a.txt"
     assert file.stat().st_nlink == 1
-    assert file.stat().st_mtime_ns == store.record("read").files["deep/a.txt"][2]
+    assert file.stat().st_mtime_ns == store.manifest.get("read").files["deep/a.txt"][2]
     monkeypatch.setattr("kros.report.manifest.file_digest", lambda path: pytest.fail("was read again"))
     store.add("read", store.stored(digest_of("a")))
 
@@ -120,7 +120,7 @@ def test_what_is_in_the_place_of_a_result_is_named(tmp_path, name):
 def test_recordings_are_listed_with_the_digests_of_their_files(tmp_path):
     motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     kros.run(motors, tmp_path / "run", until="read")
-    artefact = Store(tmp_path / "run").record("read")
+    artefact = Store(tmp_path / "run").manifest["read"]
     assert sum(name.endswith(".parquet") for name in artefact.files) == 2
     for name, (content, size, _) in artefact.files.items():
         path = tmp_path / "run" / name

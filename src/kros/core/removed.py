@@ -31,6 +31,7 @@ White-noise Kalman observers and placed poles are no longer part of kros; use ka
     observer: baselines=kalman_white baselines=luenberger kros.synthesis: luenberger
 Parts of the uncertainty are no longer public; use quantify, which takes models, systems and responses.
     kros.uncertainty: quantify_systems quantify_responses magnitude_tightness choose_nominals fit_weight optimal_cover
+    bounds Cover FittedMagnitude NominalChoice OutlierScore Weight
 Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify.
     kros.interop: AdoptedModel models_from_pykoop one_step_pairs
 Readers of one format, and steps that follow events, are no longer part of kros; use kros.read and a class from Step.
@@ -48,11 +49,6 @@ the result for its norms.
     kros.synthesis: reduce_controller
 Refined models have no class apart from others; refine_population returns their matrices.
     kros.identify.refine: Refinement
-Classes of single results of quantification are no longer public; use what quantify, choose_nominal, fit_magnitude and
-score_outliers return.
-    kros.uncertainty: Cover FittedMagnitude NominalChoice OutlierScore Weight
-Bounds of residuals over every nominal are no longer a function; use sigma_max of residual, or choose_nominal.
-    kros.uncertainty: bounds
 Models of python-control are no longer quantified by functions of their own; use kros.quantify, which takes systems and
 response data, with from_control for transfer functions, and to_control for the nominal and the weights of the result.
     kros.interop: quantify_models UncertaintyForControl uncertainty_to_control
@@ -69,9 +65,9 @@ set_bound_percent.
     kros.observer: signal_bound SignalBound
 How a load is read and scaled is no longer public; a study with recordings of the condition load estimates load torque.
     kros.motor_drive: LoadSettings TorqueScale known_load load_observer
-Status bits of a batch, monitors, guards and observers side by side are internal; step a running observer, read its
+Status bits of a batch, monitors, guards, filter banks and observers side by side are internal; step a running observer, read its
 status, and let kros.synthesize make the others.
-    kros.observer: run_with_status sample_status Monitor Guard run_observers
+    kros.observer: run_with_status sample_status Monitor Guard FilterBank run_observers
 The raw layout of motor drives is no longer written by a public function; use kros simulate --format raw.
     kros.data: write_raw
 Tables of preparation steps are no longer parsed by a public function; use kros.read, which takes them as prepare.
@@ -90,8 +86,6 @@ Resampled models are no longer public; kros.quantify and the report use them by 
     kros.identify: ModelSamples bootstrap_edmd episode_weights
 The residual-shaped observer is no longer a public function; use kros.synthesize with the method residual_h2.
     kros.synthesis: ResidualProblem residual_h2
-The start and the gaps of an observer are no longer a public class; kros.synthesize makes them, observers hold them.
-    kros.observer: FilterBank
 Undeclared disturbances are no longer simulated; remove the key, and see sensor_gains under deployment in metrics.json.
     evaluate: robustness
 Parts of the evaluation are no longer public; a study computes them, error_percent and unit_interval remain.

@@ -41,8 +41,8 @@ class Shown:
             lifted models from rest. Identified models also: ``"residuals"``, the autocorrelation of one-step residuals
             and their correlation with earlier inputs, with the 99 % band of white noise, or ``"compare"``, simulated
             beside recorded states with the fit ``100 (1 - |x - x_hat| / |x - mean(x)|)``, percent. Uncertain models:
-            ``"weights"``, the bound of the residuals. A design, an observer: ``"estimates"``. A check:
-            ``"scores"``. A run: ``"figure"``.
+            ``"weights"``, the bound of the residuals. A design, an observer: ``"estimates"``. A run:
+            ``"figure"``.
         **options
             ``unit`` and ``condition`` of recordings, by default the first held-out episode; ``model`` of identified and
             uncertain models, such as ``"linear"`` (in other conditions than that of synthesis those of EDMD only);

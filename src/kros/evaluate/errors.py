@@ -7,59 +7,37 @@ show it; error and lag against the truth do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, TypeVar
-
 import numpy as np
 
-from ..core import Array, Whole, frozen
+from ..core import Array, Whole
 
-T = TypeVar("T")
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
 
 
-@frozen
-class ErrorSummary:
-    """Errors of an estimate over a batch of episodes."""
+def errors_of(
+    estimate: Array, truth: Array, lengths: Whole, dt: float, band_hz: tuple[float, float] | None = None
+) -> dict[str, Array]:
+    """Return the errors of an estimate, (n_samples, batch, n or more), by their keys in the metrics, (batch, n) each.
 
-    rms: Array  # (batch, n)
-    percent: Array  # (batch, n): `100 rms(x_hat - x) / max|x|` of every episode
-    spectra: Array  # (batch, n_freqs, n): Welch's power spectral density of the error
-    freqs_hz: Array  # (n_freqs,)
-
-    def band_power(self, band_hz: tuple[float, float]) -> Array:
-        """Return the error's power inside a band, shape (batch, n)."""
-        inside = (self.freqs_hz >= band_hz[0]) & (self.freqs_hz <= band_hz[1])
-        return self.spectra[:, inside].sum(axis=1) * (self.freqs_hz[1] - self.freqs_hz[0])
-
-
-def joined(parts: Sequence[T], *names: str) -> T:
-    """Return errors of one batch after the other, with some fields for all of them."""
-    changed: Any = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return replace(parts[0], **changed)  # type: ignore[type-var]
-
-
-def summarise(estimates: Array, truth: Array, lengths: Whole, dt: float) -> list[ErrorSummary]:
-    """Summarise errors of estimates, shape (estimate, n_samples, batch, n or more), against (n_samples, batch, n)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return [_summary(estimate[..., : truth.shape[2]], truth, lengths, dt) for estimate in estimates]
-
-
-def _summary(estimate: Array, truth: Array, lengths: Whole, dt: float) -> ErrorSummary:
-    error = np.ascontiguousarray(np.moveaxis(estimate - truth, 0, -1))  # (batch, n, n_samples)
-    spectra = np.empty((len(lengths), _SEGMENT // 2 + 1, error.shape[1]))
-    for length in np.unique(lengths):
-        rows = lengths == length
-        error[rows, :, length:] = 0.0
-        spectra[rows] = np.swapaxes(error_spectrum(error[rows, :, :length], dt, axis=-1)[1], 1, 2)
-    rms = np.sqrt(np.einsum("bns,bns->bn", error, error) / lengths[:, None])
-    freqs_hz = np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float)
-    return ErrorSummary(rms, _percent(rms, largest(truth, lengths)), spectra, freqs_hz)
+    ``gearbox_band_power`` is the power of the error inside a band, by Welch's power spectral density.
+    """
+    estimate = estimate[..., : truth.shape[2]]
+    rms = error_rms(estimate, truth, lengths)
+    known = {"rms": rms, "error_percent": _percent(rms, largest(truth, lengths))}
+    if band_hz is not None:
+        known["gearbox_band_power"] = power = np.empty_like(rms)
+        for length in np.unique(lengths):
+            rows = lengths == length
+            with np.errstate(over="ignore", invalid="ignore"):
+                error = np.ascontiguousarray(np.moveaxis((estimate - truth)[:length, rows], 0, -1))
+                freqs_hz, density = error_spectrum(error, dt, axis=-1)
+                inside = (freqs_hz >= band_hz[0]) & (freqs_hz <= band_hz[1])
+                power[rows] = density[..., inside].sum(axis=-1) * freqs_hz[1]
+    return known
 
 
 def error_rms(estimate: Array, truth: Array, lengths: Whole) -> Array:
-    """Return the root mean square error of every episode, shape (batch, n); arguments as in `summarise`."""
+    """Return the root mean square error of every episode, shape (batch, n)."""
     with np.errstate(over="ignore", invalid="ignore"):
         error = estimate - truth
         error[np.arange(len(truth))[:, None] >= lengths] = 0.0
@@ -98,23 +76,17 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
     return np.asarray(freqs_hz), np.asarray(density)
 
 
-@frozen
-class TrueErrors:
-    """Errors of signals against truths over a batch of episodes."""
+def true_errors(signals: Array, truths: Array, lengths: Whole, dt: float) -> dict[str, Array]:
+    """Return the errors of signals against truths, (n_samples, batch, n), and how late they are, see `delay_samples`.
 
-    states: tuple[int, ...]  # column of the state that each truth is the truth of
-    rms: Array  # (batch, n_truths)
-    error_percent: Array  # (batch, n_truths): as that of `ErrorSummary`
-    lag_s: Array  # (batch, n_truths), s: how late the signal is, see `delay_samples`; NaN where that is unknown
-
-
-def true_errors(signals: Array, truths: Array, states: tuple[int, ...], lengths: Whole, dt: float) -> TrueErrors:
-    """Return the errors of signals (n_samples, batch, n) against the truths of some states, and how late these are."""
-    signals, lag = signals[..., list(states)], np.empty(truths.shape[1:])
+    Keys are those of the metrics, values have the shape (batch, n); NaN is unknown.
+    """
+    lag = np.empty(truths.shape[1:])
     for length in np.unique(lengths):
         rows = lengths == length
         lag[rows] = delay_samples(signals[:length, rows], truths[:length, rows])
-    return TrueErrors(states, error_rms(signals, truths, lengths), error_percent(signals, truths, lengths), lag * dt)
+    rms, percent = (errors(signals, truths, lengths) for errors in (error_rms, error_percent))
+    return {"true_rms": rms, "true_error_percent": percent, "true_lag_s": lag * dt}
 
 
 def delay_samples(signals: Array, truths: Array) -> Array:

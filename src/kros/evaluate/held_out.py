@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
-from ..core import Array, frozen
+from ..core import Array, ByName, Columns, Record, frozen
 from ..data import EpisodeBatch, EpisodeKey, Population
 from ..identify import ModelSet, free_run
 from ..observer import Observer, Sensors
 from ..observer.simulate import run_observers
-from .errors import ErrorSummary, TrueErrors, joined, summarise, true_errors
+from .errors import errors_of, true_errors
 from .sensor import as_shown
 
 Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
@@ -43,21 +44,12 @@ def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
 
 @frozen
 class Outcome:
-    """What one observer, baseline or model did."""
+    """What one observer, baseline or model did on some episodes; one that could not be made has facts alone."""
 
-    summary: ErrorSummary
-    shown: list[Array]
-    true: TrueErrors | None = None
-    facts: Mapping[str, Any] = field(default_factory=dict)
-    estimated: tuple[int, ...] | None = None  # states; all by default
-
-    @classmethod
-    def joined(cls, parts: Sequence[Outcome], order: Sequence[int]) -> Outcome:
-        """Join outcomes of episodes; `order` is that in which pieces are displayed."""
-        pieces, true = [piece for part in parts for piece in part.shown], [p.true for p in parts if p.true is not None]
-        summary = joined([part.summary for part in parts], "rms", "percent", "spectra")
-        shown = [pieces[i] for i in order]
-        return cls(summary, shown, joined(true, "rms", "error_percent", "lag_s") if true else None)
+    errors: dict[EpisodeKey, list[Record]] = field(default_factory=dict)  # by state, and by key in the metrics
+    shown: dict[EpisodeKey, Array] = field(default_factory=dict)  # estimates, (n_samples, n)
+    facts: ByName = field(default_factory=dict)
+    estimated: Columns | None = None  # states; all by default
 
 
 @frozen
@@ -67,8 +59,9 @@ class HeldOut:
     population: Population
     keys: tuple[EpisodeKey, ...]
     parameters: Mapping[str, dict[str, float]]
-    shown: tuple[int, ...] = ()
+    shown: tuple[EpisodeKey, ...] = ()
     sensor: Sensors = field(default_factory=dict)
+    band_hz: tuple[float, float] | None = None  # in which the power of errors is known as well
 
     def observers(self, observers: Sequence[Observer]) -> list[Outcome]:
         """Run observers that `alike` puts together."""
@@ -90,20 +83,21 @@ class HeldOut:
             states = free_run(models.A[rows], models.B[rows], models.lifting, values, first, inputs)
             return [np.swapaxes(states, 0, 1)[None]]
 
-        (outcome,) = replace(self, sensor={}).outcomes(run, truths=False)
+        (outcome,) = replace(self, sensor={}, band_hz=None).outcomes(run, truths=False)
         return outcome
 
     def outcomes(self, run: Callable[[EpisodeBatch], Iterable[Array]], truths: bool = True) -> list[Outcome]:
         """Return the outcomes of estimates, (estimate, n_samples, batch, n or more), some episodes after others."""
-        blocks, order = [], list[int]()
+        outcomes, n = list[Outcome](), len(self.population.states)
         for start in range(0, len(self.keys) or 1, SIDE_BY_SIDE):  # none at all are refused where they are read
             batch = self.read(self.keys[start : start + SIDE_BY_SIDE], truths)
-            shown = [i for i in self.shown if start <= i < start + len(batch.keys)]
-            order += shown
-            rows = [i - start for i in shown]
-            blocks.append([one for estimates in run(batch) for one in self._of_block(estimates, batch, rows)])
-        places = [order.index(i) for i in self.shown]
-        return [Outcome.joined(parts, places) for parts in zip(*blocks, strict=True)]
+            shown = [(i, key) for i, key in enumerate(batch.keys) if key in self.shown]
+            for place, estimate in enumerate(chain.from_iterable(run(batch))):
+                if start == 0:
+                    outcomes.append(Outcome())
+                outcomes[place].errors.update(self.errors(estimate[..., :n], batch))
+                outcomes[place].shown.update({key: estimate[: batch.lengths[i], i, :n].copy() for i, key in shown})
+        return outcomes
 
     def read(self, keys: Sequence[EpisodeKey], truths: bool = False) -> EpisodeBatch:
         """Read episodes as the sensor shows them."""
@@ -112,60 +106,54 @@ class HeldOut:
         states = np.ascontiguousarray(batch.states.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
         return replace(batch, states=states)
 
-    def _of_block(self, estimates: Array, batch: EpisodeBatch, rows: Sequence[int]) -> list[Outcome]:
-        n, lengths, dt = len(self.population.states), batch.lengths, self.population.sample_period_s
-        outcomes = []
-        for summary, estimate in zip(summarise(estimates, batch.states, lengths, dt), estimates, strict=True):
-            shown = [estimate[: lengths[i], i, :n].copy() for i in rows]
-            outcomes.append(Outcome(summary, shown, self.true(estimate[..., :n], batch)))
-        return outcomes
-
-    def true(self, signals: Array, batch: EpisodeBatch) -> TrueErrors | None:
-        """Return the errors of signals against the true states; None where recordings do not hold them."""
-        if batch.truths is None:
-            return None
+    def errors(self, signals: Array, batch: EpisodeBatch) -> dict[EpisodeKey, list[Record]]:
+        """Return the errors of signals in every state of episodes, against truths too where recordings hold them."""
         dt, states = self.population.sample_period_s, self.population.true_states
-        return true_errors(signals, batch.truths, states, batch.lengths, dt)
+        known = errors_of(signals, batch.states, batch.lengths, dt, self.band_hz)
+        errors = [[_at(known, i, j) for j in range(signals.shape[2])] for i in range(len(batch.keys))]
+        if batch.truths is not None:
+            true = true_errors(signals[..., list(states)], batch.truths, batch.lengths, dt)
+            for i, of_states in enumerate(errors):
+                for place, j in enumerate(states):
+                    of_states[j] |= _at(true, i, place)
+        return dict(zip(batch.keys, errors, strict=True))
 
     @property
-    def groups(self) -> dict[tuple[str, str], list[int]]:
-        """Places of the episodes of every unit and condition."""
-        groups: dict[tuple[str, str], list[int]] = {}
-        for i, key in enumerate(self.keys):
-            groups.setdefault((key.unit, key.condition), []).append(i)
+    def groups(self) -> dict[tuple[str, str], list[EpisodeKey]]:
+        """Episodes of every unit and condition."""
+        groups: dict[tuple[str, str], list[EpisodeKey]] = {}
+        for key in self.keys:
+            groups.setdefault((key.unit, key.condition), []).append(key)
         return groups
 
-    def rows(
-        self, name: str, outcome: Outcome, roles: Mapping[str, str], band: tuple[float, float] | None
-    ) -> list[dict[str, Any]]:
+    def rows(self, name: str, outcome: Outcome, roles: Mapping[str, str]) -> list[Record]:
         """Return a row for every unit, condition and estimated channel: means over the unit's episodes."""
-        summary, states = outcome.summary, self.population.states
-        power, rows = None if band is None else summary.band_power(band), list[dict[str, Any]]()
-        for (unit, condition), places in self.groups.items():
-            for j in range(len(states)) if outcome.estimated is None else sorted(outcome.estimated):
-                row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition}
-                row |= {"channel": states[j], "rms": summary.rms[places, j].mean()}
-                row["error_percent"] = summary.percent[places, j].mean()
-                row |= {} if power is None else {"gearbox_band_power": power[places, j].mean()}
-                rows.append(row | _true_entry(outcome.true, places, j))
+        columns, rows = outcome.estimated, list[Record]()
+        for (unit, condition), keys in self.groups.items() if outcome.errors else ():
+            about = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition}
+            for j, channel in enumerate(self.population.states):
+                if columns is None or j in columns:
+                    rows.append(about | {"channel": channel} | _mean([outcome.errors[key][j] for key in keys]))
         return rows
 
-    def recorded_rows(self, roles: Mapping[str, str]) -> dict[str, list[dict[str, Any]]]:
+    def recorded_rows(self, roles: Mapping[str, str]) -> dict[str, list[Record]]:
         """Return the errors of the recorded states themselves against the true ones, where recordings hold them."""
-        rows: list[dict[str, Any]] = []
-        for (unit, condition), places in self.groups.items() if self.population.truths else ():
-            batch = EpisodeBatch.read(self.population, [self.keys[i] for i in places], truths=True)
-            true = self.true(batch.states, batch)
-            for j in self.population.true_states:
-                row = {"unit": unit, "role": roles[unit], "condition": condition}
-                row |= {"channel": self.population.states[j]}
-                rows.append(row | _true_entry(true, range(len(places)), j))
+        states, rows = self.population.true_states, list[Record]()
+        for (unit, condition), keys in self.groups.items() if states else ():
+            batch = EpisodeBatch.read(self.population, keys, truths=True)
+            errors = self.errors(batch.states, batch)
+            for j in states:
+                row = {"unit": unit, "role": roles[unit], "condition": condition, "channel": self.population.states[j]}
+                means = _mean([errors[key][j] for key in keys])
+                rows.append(row | {name: mean for name, mean in means.items() if name.startswith("true_")})
         return {"recorded": rows} if rows else {}
 
 
-def _true_entry(true: TrueErrors | None, episodes: Sequence[int], state: int) -> dict[str, float]:
-    """Return errors and lag against a true state, mean over episodes; empty where it is not recorded."""
-    if true is None or state not in true.states:
-        return {}
-    at = true.states.index(state)
-    return {f"true_{what}": float(v[episodes, at].mean()) for what, v in vars(true).items() if what != "states"}
+def _at(errors: Mapping[str, Array], episode: int, state: int) -> Record:
+    """Return the errors of one state in one episode."""
+    return {name: float(values[episode, state]) for name, values in errors.items()}
+
+
+def _mean(errors: Sequence[Record]) -> Record:
+    """Return the means of errors over episodes."""
+    return {name: float(np.mean([of[name] for of in errors])) for name in errors[0]}

@@ -13,15 +13,13 @@ was fixed before (V. Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import ceil
-from typing import Any
 
 import numpy as np
 
-from ..core import ITERATED, Array, ArrayLike, DataError
+from ..core import ITERATED, Array, ArrayLike, ByName, DataError, Names, Record
 
-Row = Mapping[str, Any]
 _CELL = ("observer", "condition", "channel")
 
 
@@ -61,22 +59,21 @@ def unit_interval(values: ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[
     return result.confidence_interval.low, result.confidence_interval.high
 
 
-def interval_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def interval_rows(rows: Sequence[ByName]) -> list[Record]:
     """Return the 95 % ``interval`` of the mean error over at least three units, by observer, condition and channel."""
-    errors: dict[tuple[str, ...], dict[str, Any]] = {}
+    errors: dict[Names, Record] = {}
     for row in (row for row in rows if row["role"] == "off_nominal"):
         errors.setdefault(tuple(row[name] for name in _CELL), {})[row["unit"]] = row["error_percent"]
     intervals = []
     for cell, by_unit in errors.items():
-        values = [by_unit[unit] for unit in sorted(by_unit)]
-        if len(values) > 2 and all(value is not None and np.isfinite(value) for value in values):
-            lower, upper = unit_interval(values)
-            interval = [float(lower), float(upper)]
+        values = np.array([by_unit[unit] for unit in sorted(by_unit)], dtype=float)  # unknown is NaN
+        if len(values) > 2 and np.isfinite(values).all():
+            interval = [float(end) for end in unit_interval(values)]
             intervals.append({**dict(zip(_CELL, cell, strict=True)), "role": "off_nominal", "interval": interval})
     return intervals
 
 
-def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]:
+def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> Names:
     """Draw units that take part in nothing, by place alone; more of them include fewer."""
     drawn = np.random.default_rng(seed).permutation(len(units))[:n]
     return tuple(units[i] for i in sorted(drawn))

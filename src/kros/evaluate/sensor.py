@@ -12,7 +12,7 @@ from zlib import crc32
 
 import numpy as np
 
-from ..core import Array, ArrayLike, frozen
+from ..core import Array, ArrayLike, Whole, frozen
 from ..data import EpisodeBatch, EpisodeKey, Population
 from ..observer import Observer, Sensor, Sensors
 
@@ -36,14 +36,14 @@ def as_arriving(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str]) -> 
     return as_shown(batch, {name: Sensor(delay_samples=own.delay_samples) for name, own in sensor.items()}, states)
 
 
-def _draws(keys: Sequence[EpisodeKey], n_samples: int, seed: Sequence[int]) -> tuple[Array, Array, Array]:
-    """Draw moments, noise and chances of arrival, (n_samples, batch) each; longer episodes go on."""
+def _draws(keys: Sequence[EpisodeKey], n_samples: int, seed: Sequence[int]) -> Array:
+    """Draw moments, noise and chances of arrival, (3, n_samples, batch); longer episodes go on."""
     draws = np.empty((3, n_samples, len(keys)))
     for i, key in enumerate(keys):
         place = crc32("\0".join((key.unit, key.condition, key.episode)).encode())
         moments, noise, chances = (np.random.default_rng([*seed, place, what]) for what in range(3))
         draws[..., i] = moments.standard_normal(n_samples), noise.standard_normal(n_samples), chances.random(n_samples)
-    return draws[0], draws[1], draws[2]
+    return draws
 
 
 def _late(y: Array, behind: Array) -> Array:
@@ -55,15 +55,12 @@ def _late(y: Array, behind: Array) -> Array:
 
 @frozen
 class Arriving:
-    """Episodes as they arrive: y (n_samples, batch, q), and u (n_samples, batch, m)."""
+    """Episodes as they arrive: y (n_samples, batch, q), u (n_samples, batch, m), lengths and lifting parameters."""
 
-    batch: EpisodeBatch
     y: Array
     u: Array
-
-    def parameters(self, observer: Observer) -> dict[str, ArrayLike]:
-        """Return the lifting parameters of all episodes."""
-        return observer.own(self.batch.parameters)
+    lengths: Whole
+    parameters: dict[str, ArrayLike]
 
 
 def arriving(
@@ -76,4 +73,5 @@ def arriving(
     batch = EpisodeBatch.of(population, episodes, values)
     measured = [population.states.index(observer.lifting.states[i]) for i in observer.measured]
     y = as_arriving(batch, observer.sensor, population.states).measurements(measured)
-    return Arriving(batch, y, batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]])
+    u = batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]]
+    return Arriving(y, u, batch.lengths, observer.own(batch.parameters))

@@ -43,15 +43,10 @@ def writer(out: Path, period_s: float, facts: Record) -> Iterator[Write]:
         ):
 
             def write(key: EpisodeKey, start: int, status: Bits, values: Array) -> None:
-                labels = [pa.repeat(name, len(values)) for name in (key.unit, key.condition, key.episode)]
-                k = np.arange(start, start + len(values))
-                labels += [
-                    pa.array(k),
-                    pa.array(k * period_s),
-                    pa.array([SampleStatus(int(bits)).name for bits in status]),
-                ]
-                numbers = [pa.array(np.ascontiguousarray(column)) for column in values.T]
-                file.write_table(pa.Table.from_arrays([*labels, *numbers], schema=schema), max(len(values), 1))
+                k, bits = np.arange(start, start + len(values)), [SampleStatus(int(one)).name for one in status]
+                labels = [[name] * len(k) for name in (key.unit, key.condition, key.episode)]
+                content = dict(zip(schema.names, [*labels, k, k * period_s, bits, *values.T], strict=True))
+                file.write_table(pa.Table.from_pydict(content, schema=schema), max(len(k), 1))
 
             yield write
         if text:

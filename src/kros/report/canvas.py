@@ -34,9 +34,10 @@ def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, AnyArray]:
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
+def legend(axes: Axes, columns: int | None = None) -> None:
     """Write a legend across the top of the figure, from the labelled lines of one axes."""
     handles, labels = axes.get_legend_handles_labels()
+    figure: Any = axes.figure
     if handles:
         columns = columns or (len(handles) if sum(map(len, labels)) < 100 else 2)
         figure.set_figheight(figure.get_figheight() + DRAWING.legend_in * ceil(len(handles) / columns))
@@ -67,12 +68,6 @@ def decibel(values: ArrayLike) -> AnyArray:
     return 20 * np.log10(np.where(magnitude > 0, magnitude, np.nan))
 
 
-def line_over_shade(axes: Axes, freqs_hz: AnyArray, line: AnyArray, shade: AnyArray, colour: str) -> None:
-    """Draw magnitudes over frequency in dB, above a broad light line of what they are compared with."""
-    axes.plot(freqs_hz, decibel(shade), color=colour, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
-    axes.plot(freqs_hz, decibel(line), color=colour)
-
-
 def lines_of_units(axes: Axes, x: AnyArray, lines: AnyArray, colour: str, label: str, units: Sequence[str]) -> None:
     """Draw thin lines, shape (unit, x), a unit each, with their names; a unit without values is left out."""
     from matplotlib.collections import LineCollection
@@ -86,18 +81,19 @@ def lines_of_units(axes: Axes, x: AnyArray, lines: AnyArray, colour: str, label:
     axes.autoscale_view()
 
 
-def name_units(drawn: Artist, units: Sequence[str]) -> None:
+def name_units(drawn: Artist, units: Iterable[str]) -> None:
     """Name the units behind the lines or points of an artist, in their order: the page shows them on hover."""
     drawn.set_gid("units-" + ",".join(quote(unit, safe="") for unit in units))
 
 
-def frequency_axis(axes: Axes, freqs_hz: AnyArray, label: str = "frequency (Hz)") -> None:
-    """Make the horizontal axis logarithmic over the frequencies, with few numbers."""
+def frequency_axis(axes: Axes, freqs_hz: AnyArray) -> None:
+    """Make the horizontal axis logarithmic over the frequencies, with few numbers; below the last row it is named."""
     positive = freqs_hz[freqs_hz > 0]
     axes.set_xscale("log")
     axes.set_xlim(float(positive[0]), float(positive[-1]))
     _powers_of_ten(axes.xaxis, "{x:g}")
-    axes.set_xlabel(label)
+    if (place := axes.get_subplotspec()) and place.is_last_row():
+        axes.set_xlabel("frequency (Hz)")
 
 
 def logarithmic(axes: Axes) -> None:
@@ -134,7 +130,7 @@ def set_titles(axes: Iterable[Axes], titles: Iterable[str]) -> None:
         panel.set_title(title)
 
 
-def label_below(axes: Iterable[Axes], text: str = "frequency (Hz)") -> None:
+def label_below(axes: Iterable[Axes], text: str) -> None:
     """Label the horizontal axes of a row."""
     for panel in axes:
         panel.set_xlabel(text)

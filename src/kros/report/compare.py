@@ -8,7 +8,7 @@ from typing import Any
 from ..core import ByName, Record
 from .content import Column, Section, build
 from .facts import Facts
-from .names import number
+from .names import number, words
 from .verdict import judge
 
 _WORDS = ("settings", "data", "deployed")  # topics whose values are texts
@@ -20,6 +20,8 @@ TITLES = {
     "weights": "Uncertain models",
     "certificates": "Certificates, bounds in percent of the largest value",
 }
+_OF_MODELS = {"form": "form", "nominal": "nominal", "peak_db": "peak (dB)", "weight": "weight"}
+_OF_OBSERVERS = {"set_bound_percent": "bound", "worst_case_h2": "worst-case H2", "relift_gain": "gain at run time"}
 
 
 def comparison(runs: Mapping[str, tuple[ByName, Facts]]) -> dict[str, dict[str, list[Any]]]:
@@ -28,15 +30,15 @@ def comparison(runs: Mapping[str, tuple[ByName, Facts]]) -> dict[str, dict[str, 
     Parameters
     ----------
     runs : mapping of str to (mapping, Facts)
-        ByName and metrics of every run.
+        Settings and metrics of every run.
     """
-    settings, facts = [dict(flat(study)) for study, _ in runs.values()], [of for _, of in runs.values()]
-    compared = {name: values for name, values in side_by_side(settings).items() if len(set(values)) > 1}
+    settings = side_by_side([texts(study) for study, _ in runs.values()])
     topics = data, deployed, errors, weights, certificates
-    return {"settings": compared, **{topic.__name__: side_by_side([topic(of) for of in facts]) for topic in topics}}
+    compared = {topic.__name__: side_by_side([topic(facts) for _, facts in runs.values()]) for topic in topics}
+    return {"settings": {name: values for name, values in settings.items() if len(set(values)) > 1}, **compared}
 
 
-def side_by_side(of_runs: Sequence[Record]) -> dict[str, list[Any]]:
+def side_by_side(of_runs: Sequence[ByName]) -> dict[str, list[Any]]:
     """Return a value of every run by name, without names that no run knows."""
     names = dict.fromkeys(name for rows in of_runs for name, value in rows.items() if value not in (None, ""))
     return {name: [rows.get(name) for rows in of_runs] for name in names}
@@ -44,14 +46,14 @@ def side_by_side(of_runs: Sequence[Record]) -> dict[str, list[Any]]:
 
 def sections(names: Sequence[str], compared: Mapping[str, Mapping[str, Sequence[Any]]]) -> list[Section]:
     """Return tables with a row for everything that is compared, and a column for every run."""
-    found = []
+    shown = []
     for topic, rows in compared.items():
-        values = [[row[i] for row in rows.values()] for i in range(len(names))]
-        changes = [change(row[0], row[-1]) for row in rows.values()]
-        columns = [Column(name, column) for name, column in zip(names, values, strict=True)]
-        table = build("", [Column("", list(rows)), *columns, Column("change", changes)], prose=topic in _WORDS)
-        found.append(Section(topic, TITLES[topic], [] if table else ["Nothing differs."], tables=[table]))
-    return [section for section in found if any(section.tables) or section.key == "settings"]
+        columns = [Column(title, place) for place, title in enumerate(("", *names, "change"))]
+        values = [dict(enumerate((name, *of, change(of[0], of[-1])))) for name, of in rows.items()]
+        table = build("", columns, values, prose=topic in _WORDS)
+        if table or topic == "settings":
+            shown.append(Section(topic, TITLES[topic], [] if table else ["Nothing differs."], tables=[table]))
+    return shown
 
 
 def change(first: Any, last: Any) -> str | None:
@@ -61,25 +63,35 @@ def change(first: Any, last: Any) -> str | None:
     return f"{'+' if last >= first else ''}{number(100 * (last / first - 1))} %"
 
 
-def flat(content: ByName, before: str = "") -> Iterator[tuple[str, str]]:
-    """Yield all settings by dotted names, as text."""
+def flat(content: ByName, before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield all values that are known, by dotted names."""
     for name, value in content.items():
         if isinstance(value, Mapping):
             yield from flat(value, f"{before}{name}.")
         elif value is not None:
-            yield f"{before}{name}", text(value)
+            yield f"{before}{name}", ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
 
 
-def text(value: Any) -> str:
-    """Return a setting as text."""
-    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+def texts(content: ByName) -> Record:
+    """Return the same as texts."""
+    return {name: str(value) for name, value in flat(content)}
+
+
+def of_each(entries: Mapping[str, ByName], labels: ByName) -> Record:
+    """Return some entries of all models, or all observers, by labels of their names in the metrics."""
+    rows = Record()
+    for name, entry in entries.items():
+        for key, value in flat(entry):
+            first, *rest = key.split(".")
+            if first in labels:
+                rows[f"{name}: {', '.join([labels[first], *map(words, rest)])}"] = value
+    return rows
 
 
 def data(facts: Facts) -> Record:
     """Return what was recorded."""
-    aside = sum(row.get("group") == "outliers" for row in facts.get("units", ()))
     study = {name: value for name, value in facts.study.items() if name not in ("deployed", "alerts")}
-    return dict(flat(study | {"units_set_aside": aside}))
+    return texts(study | {"units_set_aside": len(facts.set_aside)})
 
 
 def deployed(facts: Facts) -> Record:
@@ -91,7 +103,7 @@ def deployed(facts: Facts) -> Record:
         "reasons": " ".join(reason.text for reason in verdict.reasons),
         "states": facts.entry.get("order"),
         "settles after (samples)": facts.entry.get("settle_samples"),
-        "time of the study (s)": facts.get("timing_s", {}).get("total"),
+        "time of the study (s)": facts.get("timing_s").get("total"),
     }
 
 
@@ -101,49 +113,30 @@ def errors(facts: Facts) -> Record:
     for table in facts.tables:
         where = f", {table.condition}" if len(facts.tables) > 1 else ""
         for name, cells in table.cells.items():
-            for channel in table.hidden(facts.measured, name):
-                cell, what = cells[channel], f"{name}: {channel}{where}"
-                rows |= {what: "diverged" if cell.diverged else cell.mean, f"{what}, worst unit": cell.worst}
+            for channel in table.hidden(name):
+                what = f"{name}: {channel}{where}"
+                rows |= {what: cells[channel].shown, f"{what}, worst unit": cells[channel].worst}
     return rows
 
 
 def weights(facts: Facts) -> Record:
-    """Return form, nominal and weights of every kind of model."""
-    rows = Record()
-    for kind, found in facts.get("uncertainty", {}).items():
-        weight = found.get("weight", {})
-        rows |= {
-            f"{kind}: form": found.get("form"),
-            f"{kind}: nominal": found.get("nominal"),
-            f"{kind}: orders": text(weight.get("orders", ())),
-            f"{kind}: largest residual over weight": weight.get("cover_max"),
-            f"{kind}: weight above the residuals (dB)": weight.get("overbound_db_max"),
-            f"{kind}: peak (dB)": found.get("peak_db", {}).get(found.get("form")),
-        }
-    flagged = [f"{r['unit']} ({r['condition']})" for r in facts.get("outliers", ()) if r["outlier"]]
-    return rows | ({"units flagged": text(flagged) or "none"} if rows else {})
+    """Return form, nominal and weights of every kind of model, and the units flagged."""
+    rows = of_each(facts.get("uncertainty"), _OF_MODELS)
+    flagged = [f"{r['unit']} ({r['condition']})" for r in facts.get("outliers") if r["outlier"]]
+    return rows | ({"units flagged": ", ".join(flagged) or "none"} if rows else {})
 
 
 def certificates(facts: Facts) -> Record:
-    """Return bounds over the set of plants, worst-case H2 and gains at run time of all observers."""
-    rows = Record()
-    for name, entry in facts.observers.items():
-        bounds = entry.get("set_bound_percent") or {}
-        rows |= {f"{name}: {c}": bound for c, bound in bounds.items() if c not in facts.measured}
-        rows |= {
-            f"{name}: worst-case H2": entry.get("worst_case_h2"),
-            f"{name}: gain at run time": entry.get("relift_gain"),
-        }
-    return rows
+    """Return bounds for recorded signals, worst-case H2 and gains at run time of all observers."""
+    return of_each(facts.observers, _OF_OBSERVERS)
 
 
 def lines(section: Section) -> list[str]:
     """Return the tables of a section for a terminal."""
-    found = ["", section.title, *section.paragraphs]
+    shown = ["", section.title, *section.paragraphs]
     for table in filter(None, section.tables):
-        rows = [list(table.head), *([cell.text for cell in row] for row in table.rows)]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(table.head))]
-        found += [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-        ]
-    return found
+        rows = [table.head, *([cell.text for cell in row] for row in table.rows)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        padded = ("  ".join(map(str.ljust, row, widths)) for row in rows)
+        shown += [line.rstrip() for line in padded]
+    return shown

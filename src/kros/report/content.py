@@ -1,6 +1,6 @@
 """What a page is made of, and the one builder of its tables. The template turns it into HTML and escapes every text.
 
-To add a column to a table, add one `Column` where the section builds it: a title and one value a row.
+To add a column to a table, add one `Column` where the section builds it: a title and the key of its values in the rows.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 from ..core import frozen
 from .names import number
 
+Row = dict[Any, Any]  # values by key
 Pairs = Sequence[tuple[str, Sequence[str]]]
 
 
@@ -21,10 +22,14 @@ class Column:
     """A column of a table before it is formatted; one in which nothing is known is left out."""
 
     title: str
-    values: Sequence[Any]  # a number, a text, a truth value or None a row
+    key: Any = None  # of its values in the rows, by default the title: a number, a text, a truth value or None
     group: str = ""  # title over columns that stand together
     best: bool = False  # whether the smallest number is set in bold
-    notes: Sequence[str] = ()  # small text below each value
+    note: Any = None  # key of a small text below each value
+
+    def value(self, row: Row) -> Any:
+        """Return the value in a row."""
+        return row.get(self.title if self.key is None else self.key)
 
 
 @frozen
@@ -65,18 +70,20 @@ class Section:
     lists: Pairs = ()
 
 
-def build(caption: str, columns: Sequence[Column], chosen: str | None = None, **options: bool) -> Table | None:
-    """Return a table of columns, the row whose first cell or note is `chosen` set off; None where it has no rows."""
+def build(
+    caption: str, columns: Sequence[Column], rows: Sequence[Row], chosen: str | None = None, **options: bool
+) -> Table | None:
+    """Return a table of columns, the row whose first cell is `chosen` set off; None where it has no rows."""
     first, *others = columns
-    known = [first, *(c for c in others if any(_known(v) for v in c.values))]
-    if not first.values or len(known) < 2:
+    known = [first, *(c for c in others if any(_known(c.value(row)) for row in rows))]
+    if not rows or len(known) < 2:
         return None
-    rows = list(zip(*(_cells(column) for column in known), strict=True))
+    cells = zip(*(_cells(column, rows) for column in known), strict=True)
     groups = [(title, len(list(columns_of))) for title, columns_of in groupby(known, key=lambda c: c.group)]
-    labels = [": ".join(part for part in (column.group, column.title) if part) for column in known]
-    marked = [k for k, value in enumerate(first.values) if value == chosen]
+    labels = [": ".join(filter(None, (column.group, column.title))) for column in known]
+    marked = [k for k, row in enumerate(rows) if first.value(row) == chosen]
     titled = groups if any(title for title, _ in groups) else ()
-    return Table(caption, [c.title for c in known], rows, titled, labels, marked, **options)
+    return Table(caption, [c.title for c in known], list(cells), titled, labels, marked, **options)
 
 
 def _known(value: Any) -> bool:
@@ -84,12 +91,11 @@ def _known(value: Any) -> bool:
     return value is not None and value != "" and not (isinstance(value, float) and not isfinite(value))
 
 
-def _cells(column: Column) -> list[Cell]:
+def _cells(column: Column, rows: Sequence[Row]) -> list[Cell]:
     """Return the cells of a column."""
-    numbers = [v for v in column.values if isinstance(v, float) and isfinite(v)]
-    least = min(numbers, default=None) if column.best else None
-    notes = column.notes or [""] * len(column.values)
-    return [_cell(value, note, least) for value, note in zip(column.values, notes, strict=True)]
+    values = [column.value(row) for row in rows]
+    least = min((v for v in values if isinstance(v, float) and isfinite(v)), default=None) if column.best else None
+    return [_cell(value, row.get(column.note, ""), least) for value, row in zip(values, rows, strict=True)]
 
 
 def _cell(value: Any, note: str, least: float | None) -> Cell:

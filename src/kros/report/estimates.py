@@ -26,5 +26,5 @@ def estimates_png(period_s: float, columns: Mapping[str, AnyArray], units: Mappi
             panel.fill_between(time_s, estimate - band, estimate + band, alpha=DRAWING.shade, lw=0, label="error band")
             panel.set_ylabel(f"{name} [{unit}]" if unit else name)
         panels[-1, 0].set_xlabel("time [s]")
-        legend(figure, panels[0, 0])
+        legend(panels[0, 0])
     return printed(figure, "png")

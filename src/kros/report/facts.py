@@ -1,15 +1,92 @@
-"""``metrics.json`` with what verdict and sections ask of it; any part but ``study`` may be absent."""
+"""``metrics.json`` with what verdict and sections ask of it; any part but ``study`` may be absent.
+
+Errors of observers are in tables by condition, observer and channel.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import field
 from functools import cached_property
-from typing import Any
+from operator import itemgetter
+from typing import Any, TypeVar
+
+import numpy as np
 
 from ..core import ByName, Names, frozen
+from ..core.arrays import T
+from ..data import OUTLIERS, natural_key
 from ..design.task import split_name
-from .error_tables import ErrorTable, error_tables
-from .names import observer_label, readable_unit
+from .names import observer_label, readable_unit, words
+
+K = TypeVar("K")
+Rows = Sequence[ByName]
+_CELL = ("condition", "observer", "channel")
+
+
+def grouped(rows: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """Return rows by their keys."""
+    groups = dict[K, list[T]]()
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+@frozen
+class ErrorCell:
+    """Error of an observer in a channel, percent of the largest value; None where an estimate diverged."""
+
+    means: Mapping[str, float] = field(default_factory=dict)  # over units, of what all have, by its key in the metrics
+    worst: float | None = None
+    worst_unit: str | None = None
+    worst_rms: float | None = None
+    interval: Sequence[float] = ()  # 95 % interval of the mean, by a bootstrap over units
+    diverged: int = 0  # units whose estimate diverged
+
+    @property
+    def mean(self) -> float | None:
+        """Mean error over units."""
+        return self.means.get("error_percent")
+
+    @property
+    def shown(self) -> float | str | None:
+        """Mean error as tables show it."""
+        return "diverged" if self.diverged else self.mean
+
+
+@frozen
+class ErrorTable:
+    """Errors of all observers in one condition."""
+
+    condition: str
+    cells: Mapping[str, Mapping[str, ErrorCell]]
+    measured: Names = ()
+
+    def hidden(self, observer: str | None = None) -> list[str]:
+        """Return the channels that are not measured and that an observer estimates, or any does; else all of them."""
+        estimated = self.cells.values() if observer is None else [self.cells.get(observer, {})]
+        known = dict.fromkeys(c for channels in estimated for c in channels)
+        return [c for c in known if c not in self.measured] or list(known)
+
+    def mean(self, observer: str, channels: Sequence[str]) -> float:
+        """Return the geometric mean of an observer's mean errors; infinite where one is not known."""
+        values = [self.cells[observer].get(c, ErrorCell()).mean for c in channels]
+        if not values or None in values:
+            return float("inf")
+        return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), np.finfo(float).tiny)))))
+
+
+def _cell(rows: Sequence[Any], interval: Sequence[float]) -> ErrorCell:
+    """Summarise the units of one observer and channel."""
+    lost = len({r["unit"] for r in rows if r["error_percent"] is None})
+    if lost:
+        return ErrorCell(diverged=lost)
+    worst = max(rows, key=itemgetter("error_percent"))
+    numbers = (key for key, value in rows[0].items() if not isinstance(value, str))
+    known = {key: values for key in numbers if None not in (values := [r.get(key) for r in rows])}
+    means = {key: float(np.mean(values)) for key, values in known.items()}
+    worst_rms = max(known.get("rms", ()), default=None)
+    return ErrorCell(means, float(worst["error_percent"]), worst["unit"], worst_rms, interval)
 
 
 @frozen
@@ -18,9 +95,14 @@ class Facts:
 
     metrics: ByName
 
-    def get(self, name: str, otherwise: Any = None) -> Any:
-        """Return a part of the metrics, or what is given otherwise."""
-        return self.metrics.get(name, otherwise)
+    def get(self, name: str) -> Any:
+        """Return a part of the metrics, empty where it is absent."""
+        return self.metrics.get(name, {})
+
+    @property
+    def set_aside(self) -> list[str]:
+        """Units that take no part in pooled results."""
+        return [row["unit"] for row in self.get("units") if row.get("group") == OUTLIERS]
 
     @property
     def study(self) -> ByName:
@@ -35,7 +117,7 @@ class Facts:
     @property
     def observers(self) -> Mapping[str, ByName]:
         """What is known of every observer."""
-        return self.get("observers", {})
+        return self.get("observers")
 
     @property
     def deployed(self) -> str:
@@ -57,21 +139,43 @@ class Facts:
         """Model of the deployed observer."""
         return split_name(self.deployed)[0]
 
+    def tables_of(self, rows: Rows, intervals: Rows = ()) -> list[ErrorTable]:
+        """Return rows of errors by condition, that of the models first, observer and channel."""
+        place, tables = itemgetter(*_CELL), dict[str, dict[str, dict[str, ErrorCell]]]()
+        known = {place(row): row["interval"] for row in intervals}
+        for (condition, name, channel), units in grouped(rows, place).items():
+            cell = _cell(units, known.get((condition, name, channel), ()))
+            tables.setdefault(condition, {}).setdefault(name, {})[channel] = cell
+        home = self.study["identify_on"]
+        ordered = sorted(tables, key=lambda condition: (condition != home, natural_key(condition)))
+        return [ErrorTable(condition, tables[condition], self.measured) for condition in ordered]
+
     @cached_property
     def tables(self) -> list[ErrorTable]:
-        """Errors of all observers, a table a condition, that of the models first."""
-        return error_tables(self.metrics)
+        """Errors of all observers on the units that took part, a table a condition, that of the models first."""
+        rows = [r for r in self.get("evaluation") if r["role"] in ("nominal", "off_nominal")]
+        others = [r for r in rows if r["role"] == "off_nominal"] or rows
+        return self.tables_of(others, self.get("intervals"))
 
     @property
-    def table(self) -> ErrorTable | None:
-        """Errors in the condition that the deployed observer was designed for; None where it has not been evaluated."""
-        return self.tables[0] if self.tables and self.deployed in self.tables[0].cells else None
+    def table(self) -> ErrorTable:
+        """Errors in the condition that the deployed observer was designed for; empty where it was not evaluated."""
+        return next((table for table in self.tables[:1] if self.deployed in table.cells), ErrorTable("", {}))
+
+    @property
+    def cells(self) -> Mapping[str, ErrorCell]:
+        """Errors of the deployed observer in this condition, by channel."""
+        return self.table.cells.get(self.deployed, {})
 
     @property
     def hidden(self) -> list[str]:
         """Channels that the deployed observer estimates and that are not measured."""
-        return self.table.hidden(self.measured, self.deployed) if self.table is not None else []
+        return self.table.hidden(self.deployed)
 
     def unit(self, channel: str) -> str:
         """Return the unit of measure of a channel; nothing where there is none."""
         return readable_unit(self.study.get("channels", {}).get(channel, ""))
+
+    def axis(self, channel: str) -> str:
+        """Return a channel's name with its unit of measure."""
+        return f"{words(channel)} ({self.unit(channel)})" if self.unit(channel) else words(channel)

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 from ..core import ConfigError, Progress, write_bytes
 from .canvas import Figure
-from .figures import FIGURES, draw_all
+from .figures import FIGURES, draw
 from .run_folder import RunFolder
 from .theme import DRAWING, Tone, style
 
@@ -33,7 +33,8 @@ def write_figures(run: Path, out: Path, progress: Progress | None = None) -> lis
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
     names, progress, began = [], progress or Progress(), time.perf_counter()
     progress.start("figures", len(FIGURES))
-    for drawn in draw_all(RunFolder(run)):
+    for name in FIGURES:
+        drawn = draw(name, RunFolder(run))
         progress.advance()
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)
@@ -50,7 +51,7 @@ def printed(figure: Figure, kind: str) -> bytes:
     return _encode(figure, kind, dpi=DRAWING.dots_per_inch, metadata=dict.fromkeys(_CHANGING[kind]))
 
 
-def to_svg(figure: Figure, name: str) -> str:
+def to_svg(figure: Figure, name: str, title: str) -> str:
     """Return a figure as an inline SVG element in the page's colours; `name` is the prefix of all identifiers."""
     metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     text = _encode(figure, "svg", transparent=True, metadata=metadata).decode()
@@ -58,7 +59,7 @@ def to_svg(figure: Figure, name: str) -> str:
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", text)
-    opening = r'<svg viewBox="\1" role="img" xmlns:xlink="http://www.w3.org/1999/xlink">'
+    opening = rf'<svg viewBox="\1" role="img" aria-label="{escape(title)}" xmlns:xlink="http://www.w3.org/1999/xlink">'
     text = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', opening, text, count=1)
     text = _named_units(text)
     for tone in Tone:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any
 
-from ..core import ByName, Record, write_bytes
+from ..core import ByName, Record, read_json, write_bytes
 from .content import Section
 from .facts import Facts
-from .figures import draw
+from .figures import Drawn, draw
 from .files import to_svg
 from .names import condition_label
 from .run_folder import RunFolder
@@ -23,9 +23,7 @@ from .verdict import judge
 log = logging.getLogger(__name__)
 _TEMPLATES = Path(__file__).parent / "templates"
 
-Encoded = dict[str, str]
-"""A figure as the page shows it: name, title, svg and caption, or the reason why it is left out."""
-Mapped = Callable[[Callable[[str], Encoded], Iterable[str]], Iterator[Encoded]]
+Mapped = Callable[[Callable[[str], Drawn], Iterable[str]], Iterator[Drawn]]
 
 
 def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = None) -> Path:
@@ -33,56 +31,39 @@ def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = 
 
     `mapped` maps the drawing of a figure over their names, in order, for example in several processes.
     """
-    path = out if out is not None else run / "report.html"
-    write_bytes(path, page(RunFolder(run), metrics, mapped).encode())
-    return path
-
-
-def page(run: RunFolder, metrics: ByName, mapped: Mapped = map) -> str:
-    """Return the report as HTML."""
-    from markupsafe import Markup
-
-    facts = Facts(metrics)
+    facts, path = Facts(metrics), out or run / "report.html"
     parts = [[s for make in makers if (s := make(facts)) is not None] for makers in (FIRST, EVIDENCE)]
     names = [section.figure for part in parts for section in part if section.figure]
-    figures = {}
-    for drawn in mapped(partial(encoded, RunFolder(run.folder)), names):
-        if drawn["reason"]:
-            log.info("figure %s: left out, %s", drawn["name"], drawn["reason"])
-        figures[drawn["name"]] = {**drawn, "svg": Markup(drawn["svg"])}
-    aside = sum(row.get("group") == "outliers" for row in facts.get("units", []))
+    figures = {drawn.name: drawn for drawn in mapped(partial(encoded, RunFolder(run)), names)}
+    for drawn in figures.values():
+        if drawn.reason:
+            log.info("figure %s: left out, %s", drawn.name, drawn.reason)
+    aside = len(facts.set_aside)
     count = f"{facts.study['units']} units" + (f" and {aside} set aside" if aside else "")
     conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
-    name, subtitle = run.study.get("name", run.folder.name), " · ".join([count, *conditions])
-    return filled(name, subtitle, parts[0], evidence=parts[1], figures=figures, head=judge(facts))
+    name, subtitle = read_json(run / "study.json").get("name", run.name), " · ".join([count, *conditions])
+    text = filled(name, subtitle, parts[0], evidence=parts[1], figures=figures, head=judge(facts))
+    write_bytes(path, text.encode())
+    return path
 
 
 def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) -> str:
     """Return a page of sections; `parts` are a summary, more sections as evidence, and figures by name."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
 
-    loader = FileSystemLoader(_TEMPLATES)
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    absent: Record = {"head": None, "evidence": (), "figures": {}}
-    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": Markup(stylesheet())}
-    script = Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8"))
-    return environment.get_template("report.html.jinja").render(absent | parts, script=script)
-
-
-def encoded(run: RunFolder, name: str) -> Encoded:
-    """Draw a figure and return it as the page shows it."""
-    drawn = draw(name, run)
-    svg = "" if drawn.figure is None else to_svg(drawn.figure, name)
-    svg = svg.replace('role="img"', f'role="img" aria-label="{escape(drawn.title)}"', 1)
-    return vars(drawn) | {"svg": svg, "figure": None}
-
-
-def stylesheet() -> str:
-    """Return the page's style with the tones of the figures as variables, for light and dark pages."""
     light = "".join(f"{t.variable}:{t};" for t in Tone)
-    dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)
-    text = (_TEMPLATES / "report.css").read_text(encoding="utf-8")
-    return text.replace("/* light tones */", light).replace("/* dark tones */", dark)
+    dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)  # the tones of the figures, for light and dark pages
+    style, script = ((_TEMPLATES / f"report.{end}").read_text(encoding="utf-8") for end in ("css", "js"))
+    style = style.replace("/* light tones */", light).replace("/* dark tones */", dark)
+    loader, strict = FileSystemLoader(_TEMPLATES), StrictUndefined
+    pages = Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
+    absent: Record = {"head": None, "evidence": (), "figures": {}}
+    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": style, "script": script}
+    return pages.get_template("report.html.jinja").render(absent | parts)
+
+
+def encoded(run: RunFolder, name: str) -> Drawn:
+    """Draw a figure as the page shows it."""
+    drawn = draw(name, run)
+    svg = "" if drawn.figure is None else to_svg(drawn.figure, name, drawn.title)
+    return replace(drawn, svg=svg, figure=None)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
-from typing import TypeVar
 
 from ..core import frozen
+from ..core.arrays import T
 from ..data import DEFAULT_CONDITION, EpisodeKey
 from ..design.baselines import BASELINES
 from ..design.methods import METHODS
 from ..design.task import Label, split_name
 from .theme import Tone
 
-T = TypeVar("T")
 LABELS = {method.name: method.label for method in METHODS} | BASELINES
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -96,11 +95,6 @@ def published(names: Iterable[str]) -> list[str]:
 def readable_unit(unit: str) -> str:
     """Return a unit of measure for people; nothing where there is none."""
     return "" if unit == "1" else unit
-
-
-def axis_label(channel: str, unit: str) -> str:
-    """Return a channel's name with its unit of measure."""
-    return f"{words(channel)} ({readable_unit(unit)})" if readable_unit(unit) else words(channel)
 
 
 def squared(unit: str) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from inspect import signature
 from typing import Any
 
 from ..core import ConfigError
 from .canvas import Figure
+from .figures import drawing
 from .theme import style
 
 _ESTIMATES = {"estimates": "episodes:design_figure"}
@@ -24,7 +24,6 @@ PLOTS: dict[str, dict[str, str]] = {
     "UncertainModels": {"weights": "uncertainty:sets_figure"},
     "Design": _ESTIMATES,
     "Observer": _ESTIMATES,
-    "Check": {"scores": "outliers:check_figure"},
     "RunResult": {"figure": ":run_figure"},
 }
 """Class -> kind of figure -> module and function that draws it; its further parameters are the options of `plot`."""
@@ -32,13 +31,12 @@ PLOTS: dict[str, dict[str, str]] = {
 
 def plot(result: Any, kind: str | None, **options: Any) -> Figure:
     """Draw a result."""
-    name = next(t.__name__ for t in type(result).__mro__ if t.__name__ in PLOTS)
-    kinds = PLOTS[name]
-    kind = kind or next(iter(kinds))
+    name = type(result).__name__
+    kinds = next((PLOTS[t.__name__] for t in type(result).__mro__ if t.__name__ in PLOTS), {})
+    kind = kind or next(iter(kinds), "")
     if kind not in kinds:
         raise ConfigError(f"Plot: a {name} has no figure of kind {kind!r}; choose one of {', '.join(kinds)}.")
-    module, _, function = kinds[kind].partition(":")
-    draw = getattr(import_module(f"{__package__}.figures.{module}".rstrip(".")), function)
+    draw = drawing(kinds[kind])
     known = list(signature(draw).parameters)[1:]
     if not set(options) <= set(known):
         raise ConfigError(

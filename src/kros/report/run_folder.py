@@ -5,21 +5,25 @@ Only files in the records of the run count. What a run does not have raises `Not
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
+from dataclasses import field
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
 
-from ..core import AnyArray, Names, Record, frozen, load_artifact, read_json
-from ..data.population import OUTLIERS, Channel, Channels, EpisodeKey, Role
+from ..core import AnyArray, Names, Record, frozen, load_artifact
+from ..core.arrays import T
+from ..data.population import Channel, Channels, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
+from ..identify.survey import RecordingFacts
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
 from .manifest import MANIFEST, recorded_files
-from .names import T, linear_first
+from .names import linear_first
 
 
 class NotShownError(Exception):
@@ -31,11 +35,16 @@ class Shown:
     """One held-out episode with the estimates of observers and the predictions of models."""
 
     key: EpisodeKey
-    time_s: AnyArray  # shape (n_samples,)
+    sample_period_s: float
     states: AnyArray  # shape (n_samples, n)
     inputs: AnyArray  # shape (n_samples, m)
-    observers: Mapping[str, AnyArray]  # mapping of str to ndarray, shape (n_samples, n)
-    models: Mapping[str, AnyArray]  # mapping of str to ndarray, shape (n_samples, n)
+    observers: Mapping[str, AnyArray] = field(default_factory=dict)  # by name, shape (n_samples, n)
+    models: Mapping[str, AnyArray] = field(default_factory=dict)  # by name, shape (n_samples, n)
+
+    @property
+    def time_s(self) -> AnyArray:
+        """Times of the samples, shape (n_samples,)."""
+        return np.arange(len(self.states)) * self.sample_period_s
 
 
 @frozen
@@ -56,25 +65,9 @@ class RunFolder:
         return name in self.files
 
     @cached_property
-    def study(self) -> Record:
-        """The study with all settings."""
-        return read_json(self.folder / "study.json")
-
-    @cached_property
-    def facts(self) -> Record:
+    def facts(self) -> RecordingFacts:
         """Groups of units, episodes for training and testing, condition of the models."""
-        self._require("population/facts.json", "the recordings have not been read yet")
-        return self._record("population/facts.json")
-
-    @property
-    def identify_on(self) -> str:
-        """Condition that feeds models and synthesis."""
-        return str(self.facts["identify_on"])
-
-    @property
-    def set_aside(self) -> list[str]:
-        """Units in the group of outliers, which take no part in pooled results."""
-        return [unit for unit, group in self.facts["groups"].items() if group == OUTLIERS]
+        return RecordingFacts.load(self._require("population/facts.json", "the recordings have not been read yet"))
 
     @cached_property
     def channels(self) -> Channels:
@@ -105,7 +98,7 @@ class RunFolder:
     @cached_property
     def models(self) -> dict[str, ModelSet]:
         """Models of the condition that feeds synthesis, of EDMD too where they are the start of refined ones."""
-        return self._at_home("models/*/model.json", ModelSet.load, "no models have been identified yet")
+        return self._at_home("models/([^/]+)/model.json", ModelSet.load, "no models have been identified yet")
 
     @property
     def kinds(self) -> Names:
@@ -116,31 +109,33 @@ class RunFolder:
     def uncertain(self) -> dict[str, UncertainModel]:
         """Uncertain models of the condition that feeds synthesis."""
         reason = "the uncertainty has not been quantified yet"
-        return self._at_home("uncertainty/*/*.json", UncertainModel.load, reason)
+        return self._at_home("uncertainty/([^/]+)/[^/]+.json", UncertainModel.load, reason)
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
         """Residuals of all units relative to the weights, by kind of model."""
-        return self._at_home("uncertainty/*/units/*.json", UnitResiduals.load, "there are no residuals of single units")
+        return self._at_home(
+            "uncertainty/([^/]+)/units/[^/]+.json", UnitResiduals.load, "there are no residuals of single units"
+        )
 
     @cached_property
     def others(self) -> dict[str, UnitResiduals]:
         """Residuals of the highest-scoring unit and of all others in its condition, by kind of model."""
         reason = "no unit was compared with the others; at least three units in a condition are needed"
-        residuals = self._load("outliers/*/others/*.json", UnitResiduals.load, reason)
+        residuals = self._load("outliers/([^/]+)/others/[^/]+.json", UnitResiduals.load, reason)
         return linear_first({name.partition("@")[0]: one for name, one in residuals.items()})
 
     @cached_property
     def outlier_models(self) -> dict[str, OutlierModel]:
         """Outlier scores by condition."""
         reason = "outlier scores need at least three units in a condition"
-        models = self._load("outliers/*/outlier_model.json", OutlierModel.load, reason)
-        return {unquote(name.partition("@")[2]) or self.identify_on: one for name, one in models.items()}
+        models = self._load("outliers/([^/]+)/outlier_model.json", OutlierModel.load, reason)
+        return {unquote(name.partition("@")[2]) or self.facts.identify_on: one for name, one in models.items()}
 
     @cached_property
     def syntheses(self) -> dict[str, Synthesis]:
         """Correction filters by ``model/method``."""
-        return self._load("synthesis/*/*/synthesis.json", Synthesis.load, "no observer has been synthesized yet")
+        return self._load("synthesis/(.+)/synthesis.json", Synthesis.load, "no observer has been synthesized yet")
 
     @property
     def nominal(self) -> str | None:
@@ -166,17 +161,16 @@ class RunFolder:
     def shown(self) -> list[Shown]:
         """Episodes with estimates: nominal unit, worst off-nominal unit, and the nominal unit in other conditions."""
         content, arrays = self._evaluation
-        return [self._shown(arrays, f"shown{k}/", EpisodeKey(*row)) for k, row in enumerate(content["shown"])]
 
-    def _shown(self, arrays: Mapping[str, AnyArray], start: str, key: EpisodeKey) -> Shown:
-        """Return one episode from the arrays whose names begin with `start`."""
-        part = {name.removeprefix(start): values for name, values in arrays.items() if name.startswith(start)}
-        observers, models = (
-            {name.removeprefix(kind): v for name, v in part.items() if name.startswith(kind)}
-            for kind in ("observer/", "model/")
-        )
-        time_s = np.arange(len(part["states"])) * self.sample_period_s
-        return Shown(key, time_s, part["states"], part["inputs"], observers, linear_first(models))
+        def below(start: str) -> dict[str, AnyArray]:
+            return {n.removeprefix(start): values for n, values in arrays.items() if n.startswith(start)}
+
+        shown = []
+        for k, row in enumerate(content["shown"]):
+            signals = self.sample_period_s, arrays[f"shown{k}/states"], arrays[f"shown{k}/inputs"]
+            observers, models = below(f"shown{k}/observer/"), below(f"shown{k}/model/")
+            shown.append(Shown(EpisodeKey(*row), *signals, observers, linear_first(models)))
+        return shown
 
     def _record(self, name: str) -> Record:
         """Return the content of an artifact; nothing where the run does not have it."""
@@ -184,13 +178,11 @@ class RunFolder:
         return load_artifact(path.parent, path.stem)[0] if self.has(name) else {}
 
     def _load(self, pattern: str, load: Callable[[Path], T], reason: str) -> dict[str, T]:
-        """Load the folders of all files that match a pattern, by what its stars before the file stand for."""
-        stars = [k for k, part in enumerate(pattern.split("/")[:-1]) if part == "*"]
-        paths = [PurePosixPath(name) for name in sorted(self.files) if name.count("/") == pattern.count("/")]
-        folders = {"/".join(p.parts[k] for k in stars): p.parent for p in paths if p.match(pattern)}
-        if not folders:
+        """Load the folders of all files that match a regular expression, by what its group stands for."""
+        matches = [match for name in sorted(self.files) if (match := re.fullmatch(pattern, name))]
+        if not matches:
             raise NotShownError(reason)
-        return {name: load(self.folder / folder) for name, folder in folders.items()}
+        return {match[1]: load((self.folder / match[0]).parent) for match in matches}
 
     def _at_home(self, pattern: str, load: Callable[[Path], T], reason: str) -> dict[str, T]:
         """Load by kind of model what belongs to the condition that feeds synthesis."""

@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from operator import itemgetter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,6 +15,7 @@ from ..core.artifacts import json_bytes
 from ..data import Shown
 from ..uncertainty.outliers.score import FEWEST_UNITS, Status
 from .content import Column, Section, build
+from .facts import grouped
 from .html import filled
 
 Rows = list[Record]
@@ -60,9 +62,7 @@ def with_verdict(row: Record) -> Record:
 
 def by_unit(rows: Sequence[Record]) -> dict[str, tuple[Verdict, list[str]]]:
     """Return the verdict on every unit, and the reason of every condition."""
-    units = dict[str, list[Record]]()
-    for row in rows:
-        units.setdefault(row["unit"], []).append(row)
+    units = grouped(rows, itemgetter("unit"))
     return {u: (worst(of), [f"{row['condition']}: {row['reason']}" for row in of]) for u, of in units.items()}
 
 
@@ -88,10 +88,8 @@ def csv_text(rows: Rows) -> str:
 
 def html_text(rows: Rows) -> str:
     """Return a page with a table of units and conditions."""
-    columns = [
-        Column(name, [str(row.get(name)) for row in rows]) for name in ("unit", "condition", "verdict", "reason")
-    ]
-    section = Section("units", "Units", tables=[build("", columns, prose=True)])
+    columns = [Column(name) for name in ("unit", "condition", "verdict", "reason")]
+    section = Section("units", "Units", tables=[build("", columns, rows, prose=True)])
     return filled("kros check", worst(rows), [section])
 
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from enum import Enum
+from operator import itemgetter
 
 from ..core import ByName, frozen
 from ..data import some
 from ..design.task import split_name
-from .error_tables import ErrorCell, ErrorTable, tables_of
-from .facts import Facts
+from .facts import ErrorCell, ErrorTable, Facts, grouped
 from .names import condition_label, joined, label_of, number, observer_label, words
 
 Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the section with the details
@@ -101,9 +101,8 @@ def _numbers(facts: Facts) -> list[Number]:
     """Return the errors of at most two hidden channels, and how many units are flagged."""
     numbers = []
     for channel in facts.hidden[:2]:
-        cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else ErrorCell()
+        cell, known = facts.cells[channel], facts.cells[channel].means
         if cell.mean is not None:
-            known = cell.means
             notes = [f"RMS {number(known['rms'])} {facts.unit(channel)}".strip()] if known.get("rms") else []
             notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
             if error := known.get("true_error_percent"):
@@ -125,20 +124,20 @@ def _lag(lag_s: float | None) -> str:
 
 def _stopping(facts: Facts) -> Checks:
     """Yield what stops, what to do, and where the details are."""
-    table, hidden = facts.table, facts.hidden
+    hidden = facts.hidden
     if not facts.deployed:
         yield "The run stopped before an observer was designed.", "Run it to its end.", "run"
-    elif table is None:
+    elif not facts.cells:
         yield f"“{facts.label}” has not been evaluated.", "Run it to its end.", "run"
-    elif any(table.cells[facts.deployed][c].mean is None for c in hidden):
+    elif any(facts.cells[c].mean is None for c in hidden):
         text = f"The estimates of “{facts.label}” diverge on held-out episodes."
         yield text, "Do not use it; look at the models first.", "models"
-    elif hidden and not_improved(table, facts.deployed, hidden) == hidden:
+    elif hidden and not_improved(facts) == hidden:
         text = f"“{facts.label}” is no better than its model without correction."
         yield text, f"Measure a signal that depends more on {channels(hidden)}.", "errors"
-    left = tables_of(facts.get("left_out", {}).get("rows", []), facts.study["identify_on"])
-    cells = left[0].cells.get(facts.deployed, {}) if left else {}
-    if any(cell.mean is None for c, cell in cells.items() if c not in facts.measured):
+    left_out = facts.tables_of(facts.get("left_out").get("rows", ()))
+    lost = [c for table in left_out[:1] for c, cell in table.cells.get(facts.deployed, {}).items() if cell.diverged]
+    if set(lost) - set(facts.measured):
         text = "Designed without the unit that it runs on, this kind of observer diverges on some units."
         yield text, "Do not use it on new units.", "left-out"
 
@@ -147,7 +146,7 @@ def _of_recordings(facts: Facts) -> Checks:
     """Yield alerts of the recordings, confounded conditions, and too short recordings."""
     for alert in facts.study.get("alerts", ()):
         yield f"Recordings: {alert.rstrip('.')}.", "Look at the recordings.", "recordings"
-    rows = [row for row in facts.get("units", []) if row.get("conditions") and row.get("group") != "outliers"]
+    rows = [row for row in facts.get("units") if row.get("conditions") and row.get("group") != "outliers"]
     inside = [row for row in rows if facts.study["identify_on"] in row["conditions"]]
     if len(inside) < len(rows):
         single = all(len(row["conditions"]) == 1 for row in rows)
@@ -155,7 +154,7 @@ def _of_recordings(facts: Facts) -> Checks:
         text += f"Models and observers describe {len(inside)} of {len(rows)} units, those recorded in "
         text += f"“{condition_label(facts.study['identify_on'])}”."
         yield text, "Record all units in the same conditions.", "recordings"
-    noise = facts.get("uncertainty", {}).get(facts.model, {}).get("noise_share")
+    noise = facts.get("uncertainty").get(facts.model, {}).get("noise_share")
     if noise and noise["at_peak"] >= THRESHOLDS.noise:
         text = f"{100 * noise['at_peak']:.0f} % of the spread at {number(noise['peak_hz'])} Hz is estimation noise, "
         yield f"{text}not variation between units.", "Record longer, or more episodes.", "spread"
@@ -163,7 +162,7 @@ def _of_recordings(facts: Facts) -> Checks:
 
 def _of_units(facts: Facts) -> Checks:
     """Yield units that are flagged, undecided or have a remark."""
-    rows = facts.get("outliers", [])
+    rows = facts.get("outliers")
     if flagged := [r for r in rows if r["outlier"]]:
         text = f"Flagged as not belonging to the batch: {units_text(flagged)}."
         yield text, "Inspect these units before they are shipped.", "units"
@@ -172,13 +171,9 @@ def _of_units(facts: Facts) -> Checks:
         need = f"{most['unit']} needs {number(most['needed_s'])} s, has {number(most['recorded_s'])} s"
         yield _inconclusive(short, rows), f"Record longer: {need}.", "units"
     if few := [r for r in undecided(rows) if r["status"] == "cannot tell"]:
-        yield (
-            _inconclusive(few, rows),
-            "Score against more units in one condition, at least 8, that are more alike.",
-            "units",
-        )
-    remarks = [f"{r['unit']} ({r['status']})" for r in facts.get("units", []) if r.get("status", "ok") != "ok"]
-    if remarks:
+        action = "Score against more units in one condition, at least 8, that are more alike."
+        yield _inconclusive(few, rows), action, "units"
+    if remarks := [f"{r['unit']} ({r['status']})" for r in facts.get("units") if r.get("status", "ok") != "ok"]:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
 
 
@@ -192,8 +187,6 @@ def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
 def _of_errors(facts: Facts) -> Checks:
     """Yield better observers, channels without improvement, and bounds that errors exceed."""
     table, hidden = facts.table, facts.hidden
-    if table is None:
-        return
     ratio, others = 1 - THRESHOLDS.better, [name for name in table.cells if name != facts.deployed]
     if rivals := [name for name in others if _smaller(table, name, facts.deployed, hidden, ratio)]:
         better = min(rivals, key=lambda name: table.mean(name, hidden))  # the most accurate one
@@ -202,18 +195,17 @@ def _of_errors(facts: Facts) -> Checks:
         export = f"`kros export c --observer {better}` exports it."
         action = export if designed else "It is a baseline that is not exported."
         yield text, f"Compare both. {action}", "errors"
-    same = not_improved(table, facts.deployed, hidden)
+    same = not_improved(facts)
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."
         yield text, "Do not rely on the estimate more than on the model.", "errors"
-    errors = {c: table.cells[facts.deployed][c].mean for c in hidden}
-    if large := {c: e for c, e in errors.items() if e is not None and e > 100 * THRESHOLDS.large}:
+    errors = {c: facts.cells[c].mean or 0.0 for c in hidden}
+    if large := {c: error for c, error in errors.items() if error > 100 * THRESHOLDS.large}:
         each = joined([f"{words(c)} ({number(e)} % of the largest value)" for c, e in large.items()])
         yield f"The error is large: {each}.", "Measure another signal, or use the estimate for trends alone.", "errors"
     for channel, bound in (facts.entry.get("set_bound") or {}).items():
-        cell = table.cells[facts.deployed].get(channel)
-        if cell is not None and cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
-            unit = facts.unit(channel)
+        cell, unit = facts.cells.get(channel, ErrorCell()), facts.unit(channel)
+        if cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
             text = f"A held-out episode exceeds the largest RMS error expected: {words(channel)} of unit "
             text += f"{cell.worst_unit} has {number(cell.worst_rms)} {unit}, expected were {number(bound)} {unit}."
             yield text, "Do not rely on this number; record more kinds of episodes.", "certificates"
@@ -229,11 +221,11 @@ def _of_certificates(facts: Facts) -> Checks:
         yield text, "Do not rely on the bounds for these units.", "certificates"
     if facts.observers and all(label_of(name).baseline for name in facts.observers):
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
-    bound = facts.get("uncertainty", {}).get(facts.model, {}).get("weight", {}).get("cover_max")
+    bound = facts.get("uncertainty").get(facts.model, {}).get("weight", {}).get("cover_max")
     if bound is not None and bound > 1:
         action = "Use kros.quantify(models, max_order=6) in Python."
         yield "The weights do not bound all units that they were fitted to.", action, "uncertainty"
-    for fold, why in facts.get("left_out", {}).get("failed", {}).items():
+    for fold, why in facts.get("left_out").get("failed", {}).items():
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
 
 
@@ -244,10 +236,8 @@ def undecided(rows: Sequence[ByName]) -> list[ByName]:
 
 def units_text(rows: Sequence[ByName]) -> str:
     """Return units with their conditions, for a sentence."""
-    units = dict[str, list[str]]()
-    for row in rows:
-        units.setdefault(row["unit"], []).append(condition_label(row["condition"]))
-    named = {unit: ", ".join(filter(None, conditions)) for unit, conditions in units.items()}
+    units = grouped(rows, itemgetter("unit")).items()
+    named = {unit: ", ".join(filter(None, (condition_label(r["condition"]) for r in of))) for unit, of in units}
     return some([f"{unit} ({conditions})" if conditions else unit for unit, conditions in named.items()])
 
 
@@ -283,12 +273,12 @@ def voids(facts: Facts) -> list[str]:
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]
 
 
-def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:
-    """Return the channels in which an observer is no better than its model without correction."""
-    other = f"{split_name(name)[0]}/open_loop"
-    if name == other or other not in table.cells:
+def not_improved(facts: Facts) -> list[str]:
+    """Return the hidden channels in which the deployed observer is no better than its model without correction."""
+    other, ratio = f"{facts.model}/open_loop", 1 - THRESHOLDS.improved
+    if facts.deployed == other or other not in facts.table.cells:
         return []
-    return [c for c in channels if not _smaller(table, name, other, [c], 1 - THRESHOLDS.improved)]
+    return [c for c in facts.hidden if not _smaller(facts.table, facts.deployed, other, [c], ratio)]
 
 
 def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from ..core import Record, load_artifact, plain
 from ..evaluate.over_units import interval_rows
-from ..observer import Observer
 from ..observer.sensor_gains import sensor_gains
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel
@@ -24,8 +23,7 @@ def collect_metrics(context: Context, until: Stage) -> Record:
     manifest = context.store.manifest
     timing = {str(stage): manifest[stage].seconds for stage in done if stage in manifest}
     timing["total"] = sum(timing.values())
-    metrics: Record = {"schema": 1, "study": _study(context, done), "timing_s": timing}
-    metrics["units"] = _units(context, done)
+    metrics = {"schema": 1, "study": _study(context, done), "timing_s": timing, "units": _units(context, done)}
     for stage in done:
         if stage is Stage.EVALUATE:
             metrics |= _evaluation(context, metrics)
@@ -35,7 +33,7 @@ def collect_metrics(context: Context, until: Stage) -> Record:
 
 
 def _study(context: Context, done: list[Stage]) -> Record:
-    facts, population, sensor = context.facts, context.population, context.config.sensor
+    facts, population = context.facts, context.population
     parts = {"train": facts.train, "held_out": facts.test}
     study: Record = {
         "units": len(facts.pooled),
@@ -52,11 +50,8 @@ def _study(context: Context, done: list[Stage]) -> Record:
         "resolution": facts.resolution,
         "dropped": facts.dropped,
     }
-    optional = {
-        "sensor": {name: one.model_dump(exclude_none=True) for name, one in sensor.items()},
-        "alerts": facts.alerts,
-    }
-    study |= {name: value for name, value in optional.items() if value}
+    sensor = {name: one.model_dump(exclude_none=True) for name, one in context.config.sensor.items()}
+    study |= {name: value for name, value in (("sensor", sensor), ("alerts", facts.alerts)) if value}
     if Stage.IDENTIFY in done:
         study["alpha"] = context.identified.models(context.identified.edmd_kinds[0]).alpha
     return study | ({"deployed": context.observers_record["deployed"]} if Stage.SYNTHESIZE in done else {})
@@ -68,8 +63,8 @@ def _units(context: Context, done: list[Stage]) -> list[Record]:
     models = context.identified.models() if Stage.IDENTIFY in done else None
     for unit, group in facts.groups.items():
         keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
-        row: Record = {"unit": unit, "group": group}
-        row |= {"conditions": list(dict.fromkeys(k.condition for k in keys)), "status": "ok"}
+        conditions = list(dict.fromkeys(k.condition for k in keys))
+        row: Record = {"unit": unit, "group": group, "conditions": conditions, "status": "ok"}
         if calibration is not None:
             phase = calibration.units.get(unit)
             row |= {name: getattr(phase, name, None) for name in ("phase_rad", "concentration")}
@@ -84,12 +79,11 @@ def _units(context: Context, done: list[Stage]) -> list[Record]:
 
 def _calibration(context: Context) -> Record:
     """What the phase of every unit belongs to; empty for a study without one."""
-    calibration = context.calibration
-    if calibration is None:
+    if (calibration := context.calibration) is None:
         return {}
     spec = calibration.spec
-    entry = {name: getattr(spec, name) for name in ("ratio", "angle", "parameter")}
-    return {"calibration": entry | {"lag_rad": calibration.lag_rad}}
+    entry = {"ratio": spec.ratio, "angle": spec.angle, "parameter": spec.parameter, "lag_rad": calibration.lag_rad}
+    return {"calibration": entry}
 
 
 def _models(context: Context) -> Record:
@@ -98,9 +92,8 @@ def _models(context: Context) -> Record:
     for name in context.identified.kinds:
         models = context.identified.models(name)
         rows = [models.index(u) for u in context.facts.pooled if u in models.unit_ids]
-        radius = float(models.spectral_radius()[rows].max())
-        lifting = {"order": models.lifting.n_lifted, "functions": list(models.lifting.functions)}
-        entries[name] = lifting | {"spectral_radius_max": radius}
+        radius, lifting = models.spectral_radius()[rows].max(), models.lifting
+        entries[name] = {"order": lifting.n_lifted, "functions": lifting.functions, "spectral_radius_max": radius}
     return {"models": entries}
 
 
@@ -113,11 +106,14 @@ def _uncertainty(context: Context) -> Record:
 
 def _uncertain_model(store: Store, name: str, model: UncertainModel) -> Record:
     """Return the metrics of one uncertain model, and the share of noise in it."""
-    weight = model.weight
-    entry: Record = {name: getattr(model, name) for name in ("form", "peak_db", "misfit_max")}
-    entry["nominal"] = model.nominal_id
-    entry["weight"] = {name: getattr(model, name) for name in ("cover_max", "overbound_db_max")}
-    entry["weight"]["orders"] = [weight.left_orders, weight.right_orders]
+    orders = [model.weight.left_orders, model.weight.right_orders]
+    entry: Record = {
+        "form": model.form,
+        "nominal": model.nominal_id,
+        "peak_db": model.peak_db,
+        "misfit_max": model.misfit_max,
+        "weight": {"orders": orders, "cover_max": model.cover_max, "overbound_db_max": model.overbound_db_max},
+    }
     if store.holds("uncertainty", name, "noise"):
         facts, _ = load_artifact(store.path("uncertainty", name, "noise"), "noise_share")
         entry["noise_share"] = {key: facts[key] for key in ("median", "at_peak", "peak_hz")}
@@ -139,16 +135,16 @@ def _observers(context: Context) -> Record:
 
 def _deployment(context: Context) -> Record:
     """Return what the deployed observer reads, estimates and needs of its sensors."""
-    observer = Observer.load(context.store.path("observers", "deployed.json"))
+    observer = context.deployed
     measured, sizes = observer.outputs, observer.about["largest_in_training"]
     return {
         "measured": measured,
-        "inputs": list(observer.inputs),
-        "estimates": list(observer.recorded),
+        "inputs": observer.inputs,
+        "estimates": observer.recorded,
         "largest": {name: sizes[name] for name in (*measured, *observer.inputs)},
         "delay_samples": observer.runtime.delay,
         "parameters": {name: observer.parameters.get(name) for name in observer.lifting.parameters},
-        "functions": list(observer.lifting.functions),
+        "functions": observer.lifting.functions,
         "states": observer.lifting.n_states + observer.controller.n_states,
         "sensor": observer.about["sensor"],
         "sensor_gains": sensor_gains(observer, sizes),

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from ..core import ByName, ConfigError, Executor, Progress, Record, Work, member, write_json
-from ..data import Population, Shown, detect_reader
+from ..data import OUTLIERS, Population, Shown, detect_reader
 from ..identify import IdentifiedModels
-from ..observer import Observer
+from ..identify.presets import resolve_lifting, resolve_phase
+from ..identify.survey import check_usable
+from ..observer import Observer, require_measured
 from ..report.facts import Facts
 from ..report.unit_verdicts import Check
 from ..report.verdict import judge
@@ -151,36 +153,39 @@ def run(
 
 def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: ByName) -> StudyConfig:
     """Return the study of some recordings, or a study, with keys of some tables changed."""
-    base, tables = Path(), dict(sections)
+    tables = dict(sections)
     if isinstance(source, Population):
         if set(tables.get("data", ())) & {"source", "reader"}:
             raise ConfigError("Run: data.source and data.reader name recordings, and a population is given; drop them.")
-        raw: Record = {"name": out.name, "data": {"source": learning.ARRAYS, "reader": learning.ARRAYS}}
-        base = out
+        raw: Record = {"name": out.name, "data": {"source": out / learning.ARRAYS, "reader": learning.ARRAYS}}
     elif isinstance(source, StudyConfig):
         raw = source.dump()
     elif not isinstance(source, str | Path):
         raise ConfigError(f"Run: needs a Population, a folder or a study, found {type(source).__name__}.")
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
-        raw = {"name": out.name, "data": {"source": str(source)} | ({"reader": reader} if reader else {})}
+        raw = {"name": out.name, "data": {"source": source} | ({"reader": reader} if reader else {})}
     else:
         raw = load_config(source).dump()
     if isinstance(tables.get("lifting"), list | tuple):
         tables["lifting"] = {"functions": tables["lifting"]}
     for name, table in tables.items():
         raw[name] = {**raw.get(name, {}), **table} if isinstance(table, Mapping) else table
-    return validate_config(raw, base, str(source) if isinstance(source, str | Path) else f"for {out}")
+    return validate_config(raw, Path(), str(source) if isinstance(source, str | Path) else f"for {out}")
 
 
 def require_usable(config: StudyConfig, until: Stage, population: Population | None = None) -> None:
     """Refuse what can be refused from the names of recordings alone."""
     population = learning.open_source(config, population)
-    learning.check_source(
-        config, population, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY)
-    )
-    if left_out.wanted(config):
-        left_out.check_folds(config, learning.taking_part(config, population))
+    single_allowed = until in (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY)
+    check_usable(population, config.split.test, config.data.identify_on, single_allowed)
+    reserve = learning.draw(config, population)
+    population = population.select([unit for unit in population.unit_ids if unit not in reserve])
+    lifting = resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
+    resolve_phase(config.calibrate, population, lifting)
+    require_measured(config.sensor, population.measured)
+    if config.evaluate.folds:
+        left_out.parted([u.id for u in population.units if u.group != OUTLIERS], config.evaluate.folds)
 
 
 def run_in(

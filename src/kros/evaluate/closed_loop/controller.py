@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field
 
-from ...core import AGREED, Array, ConfigError, Record, Settings, StateSpace, did_you_mean, gain
+from ...core import AGREED, Array, ConfigError, Names, Record, Settings, StateSpace, did_you_mean, gain
 from ...core.lti import real_array
 from ...identify import ModelSet
 from ...observer import recorded_factors
@@ -35,8 +35,8 @@ class Controller(Settings):
     C: Rows = ()
     D: Rows
     sample_period_s: float
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
+    inputs: Names
+    outputs: Names
     limits: dict[str, tuple[float, float]] = Field({}, description="of the plant's inputs, where actuators have some")
 
     @classmethod

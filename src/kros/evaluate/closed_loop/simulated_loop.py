@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...core import Names
 from ...data import EpisodeBatch
 from ...identify import ModelSet
 from ...observer import screened
@@ -14,7 +15,7 @@ from .controller import Controller
 
 def diverging(
     observer: ObserverData, models: ModelSet, batch: EpisodeBatch, controller: Controller, largest: float
-) -> tuple[str, ...]:
+) -> Names:
     """Return units whose loop diverges from where an episode began, its inputs being the command."""
     lifting, rows = models.lifting, [models.index(unit) for unit in batch.units]
     values = {name: v[rows] for name, v in models.parameters.items()}

@@ -45,15 +45,15 @@ class LoopResult:
     """
 
     status: str
-    reasons: tuple[str, ...] = ()  # of a verdict that is not SAFE
+    reasons: Names = ()  # of a verdict that is not SAFE
     margin: float | None = None  # largest scaling of the set for which stability is proven
     destabilising: float | None = None  # smallest scaling for which a perturbation was found that destabilises
     at_hz: float | None = None  # its frequency
     spectral_radius: Mapping[str, float] = field(default_factory=dict)  # of every unit's loop
-    diverged: tuple[str, ...] = ()  # units whose nonlinear loop diverges in simulation
+    diverged: Names = ()  # units whose nonlinear loop diverges in simulation
     error_gain: float | None = None  # proven largest gain from command to error over the set, signals in ranges
     nominal_gain: float | None = None  # that of the nominal unit
-    assumptions: tuple[str, ...] = ASSUMPTIONS
+    assumptions: Names = ASSUMPTIONS
 
     def lines(self) -> list[str]:
         """Return what people read."""

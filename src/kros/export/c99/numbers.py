@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -78,8 +79,9 @@ class Source:
         from jinja2 import Environment, PackageLoader, StrictUndefined
 
         environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
-        filters = {"row": self.row, "sums": self.sums, "literal": self.precision.literal, "code": self.code}
-        environment.filters |= filters | {"double": DOUBLE.literal, "wide": row, "plain": plain}
+        filters = {"row": partial(row, precision=self.precision), "sums": self.sums, "code": self.code}
+        filters |= {"literal": self.precision.literal, "double": DOUBLE.literal, "wide": row, "plain": plain}
+        environment.filters |= filters
         context = self.context() | more
         return {file: environment.get_template(f"{name}.jinja").render(context) for file, name in files.items()}
 
@@ -164,6 +166,9 @@ class Source:
         """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""
         o, name, n, states = self.observer, loop.name, self.observer.lifting.n_states, self.observer.lifting.states
         slopes, given = [], () if o.bank is None else o.measured  # measurements take the place of estimates
+        uncorrected = o.A.copy()  # the model with the direct correction, lifted functions held
+        uncorrected[:, list(o.measured)] -= o.into @ o.controller.D
+        uncorrected[:, list(given)] = 0.0
         for f in o.lifting.formulas:
             by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used and j not in given}
             lines = [(j, f"({self.code(d)})") for j, d in by_state.items() if d != 0]
@@ -173,9 +178,9 @@ class Source:
             "place": o.lifting.parameters.index(name),
             "slopes": slopes,
             "reads_states": any("w[" in str(row) for row in slopes),
-            "model": self.sums(_uncorrected(o)[:n]),
+            "model": self.sums(uncorrected[:n]),
             "correction": self.sums((o.into @ o.controller.C)[:n]),
-            "shares": self.row(measurement_sizes(o) ** -2),
+            "shares": row(measurement_sizes(o) ** -2, self.precision),
             "settle_s": o.sample_period_s / loop.forget,
             "forget": self.precision.literal(loop.forget),
             "most": self.precision.literal(MOST),
@@ -211,10 +216,6 @@ class Source:
         """Return what is multiplied by which entry of a column, row by row; zeros are left out."""
         return [[(int(j), self.precision.literal(float(row[j]))) for j in np.flatnonzero(row)] for row in values]
 
-    def row(self, values: Array) -> list[Any]:
-        """Return the literals of numbers, row by row."""
-        return row(values, self.precision)
-
     def code(self, expression: Any) -> str:
         """Return the C expression of a formula's tree."""
         return c_code(expression, self.symbol, self.precision)
@@ -234,12 +235,3 @@ def row(values: Array, precision: Precision = DOUBLE) -> list[Any]:
     if values.ndim > 1:
         return [row(one, precision) for one in values]
     return [precision.literal(v) for v in np.clip(values, -precision.largest, precision.largest).tolist()]
-
-
-def _uncorrected(observer: Observer) -> Array:
-    """Return the model with the direct correction, lifted functions held, shape (n_lifted, n_lifted)."""
-    A = observer.A.copy()
-    A[:, list(observer.measured)] -= observer.into @ observer.controller.D
-    if observer.bank is not None:
-        A[:, list(observer.measured)] = 0.0
-    return A

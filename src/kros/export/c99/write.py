@@ -68,56 +68,55 @@ def export_c(
     ...     print("lag_step" in (written / "lag.h").read_text())
     True
     """
-    files = c_files(observer, Source.of(observer, name, precision, track, load))
+    files = c_files(Source.of(observer, name, precision, track, load))
     with whole_folder(Path(out)) as folder:
         for file, text in files.items():
             write_bytes(folder / file, text.encode())
     return Path(out)
 
 
-def c_files(observer: Observer, source: Source) -> dict[str, str]:
+def c_files(source: Source) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
-    name, track = source.name, None if source.loop is None else source.loop.name
-    state_bytes = _state_bytes(source)
+    name, state_bytes = source.name, _state_bytes(source)
     texts = {f"{name}.h": "observer.h", f"{name}.c": "observer.c", f"{name}_selftest.c": "selftest.c"}
     texts |= {file: file for file in ("example_main.c", "CMakeLists.txt", "README.md")}
-    more = {"version": version("kros"), "state_bytes": state_bytes, **_golden(observer, source, track)}
-    manifest = _manifest(observer, source, state_bytes) | ({} if track is None else {"tracked": track})
-    return source.rendered("kros.export.c99", texts, more) | {"manifest.json": json_bytes(manifest).decode()}
+    more = {"version": version("kros"), "state_bytes": state_bytes, **_golden(source)}
+    manifest = json_bytes(_manifest(source, state_bytes)).decode()
+    return source.rendered("kros.export.c99", texts, more) | {"manifest.json": manifest}
 
 
-def _golden(observer: Observer, source: Source, track: str | None) -> Record:
+def _golden(source: Source) -> Record:
     """Return the literals of golden vectors in the units of the recordings, and their tolerance."""
-    tolerance, factors = TOLERANCE[source.precision.type], source.factors()
-    golden = Golden.of(observer, track, tolerance=tolerance)
-    y, u, x = (
-        np.array([factors[n] for n in names]) for names in (observer.outputs, observer.inputs, observer.recorded)
-    )
+    observer, factors, tolerance = source.observer, source.factors(), TOLERANCE[source.precision.type]
+    golden = Golden.of(observer, None if source.loop is None else source.loop.name, tolerance)
+    signals = {
+        "y": (golden.y, observer.outputs),
+        "u": (golden.u, observer.inputs),
+        "x": (golden.x_hat, observer.recorded),
+    }
+    recorded = {name: values / [factors[channel] for channel in names] for name, (values, names) in signals.items()}
+    largest = np.maximum(np.abs(recorded["x"]).max(axis=0), np.finfo(float).tiny)
     literals = {
-        "y": [[_sample(v) for v in row] for row in golden.y / y],
-        "u": [[_sample(v) for v in row] for row in golden.u / u],
-        "x": [[f"{v:.17g}" for v in row] for row in golden.x_hat / x],
-        "status": [f"{int(s)}u" for s in golden.status],
-        "last": [f"{int(s)}u" for s in golden.last_status],
-        "sure": [[f"{int(bits)}u" for bits in row] for row in golden.sure],
+        **{name: [[_sample(v) for v in row] for row in values] for name, values in recorded.items()},
+        "status": [f"{bits}u" for bits in golden.status],
+        "last": [f"{bits}u" for bits in golden.last_status],
+        "sure": [[f"{bits}u" for bits in of_bits] for of_bits in golden.sure],
         "passes": golden.passes,
-        "tolerance": [
-            f"{tolerance * v:.9g}"
-            for v in np.maximum(np.abs(golden.x_hat).max(axis=0), np.finfo(float).tiny) / np.abs(x)
-        ],
+        "tolerance": [f"{v:.9g}" for v in tolerance * largest],
     }
     return {"golden": literals, "tolerance": tolerance}
 
 
-def _manifest(observer: Observer, source: Source, state_bytes: int) -> Record:
+def _manifest(source: Source, state_bytes: int) -> Record:
+    observer = source.observer
     deployed = json_bytes(with_checksum(observer_content(observer)))
-    return {
+    content = {
         "name": source.name,
         "precision": source.precision.type,
-        "states": list(observer.recorded),
+        "states": observer.recorded,
         "measured": observer.outputs,
-        "inputs": list(observer.inputs),
-        "parameters": list(observer.lifting.parameters),
+        "inputs": observer.inputs,
+        "parameters": observer.lifting.parameters,
         "units_of_measure": {s["name"]: s["unit"] for s in source.signals()},
         "sample_period_s": observer.sample_period_s,
         "state_bytes": state_bytes,
@@ -125,6 +124,7 @@ def _manifest(observer: Observer, source: Source, state_bytes: int) -> Record:
         "kros": version("kros"),
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
     }
+    return content | ({} if source.loop is None else {"tracked": source.loop.name})
 
 
 def _sample(value: float) -> str:
@@ -161,11 +161,12 @@ class Golden:
     sure: AnyArray
 
     @classmethod
-    def of(cls, observer: Observer, track: str | None = None, count: int = 60, tolerance: float = 0.0) -> Golden:
+    def of(cls, observer: Observer, track: str | None = None, tolerance: float = 0.0) -> Golden:
         """Run an observer on smooth signals with a missing measurement, a lost input and a spike."""
         q, m = len(observer.measured), len(observer.inputs)
         seen = observer.seen
         y_size, u_size = (np.ones(q), np.ones(m)) if seen is None else (seen.measured, seen.inputs)
+        count = 60
         k = np.arange(count)[:, None]
         y = y_size * 0.5 * np.sin(k / 20 + np.arange(q))
         u = u_size * 0.5 * np.sin((k + 1) / 20 + np.arange(m))

@@ -81,13 +81,18 @@ def export_fmu(
     if out.suffix != ".fmu" or out.exists():
         raise ConfigError(f"Export of an FMU: {out} should be a new file that ends in .fmu.")
     source = Source.of(observer, name, precision, track)
-    files = c_files(observer, source)
+    files = c_files(source)
     sources = {f"sources/{file}": files[file] for file in (f"{name}.h", f"{name}.c")}
     guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
     texts = fmu_files(source, fmi, guid)
     every = {**texts, **sources, "documentation/README.md": files["README.md"]}
     packed = {file: text.encode() for file, text in every.items()}
-    write_bytes(out, _archive(packed | compiled(packed, name, fmi)))
+    packed |= compiled(packed, name, fmi)
+    archived = io.BytesIO()
+    with zipfile.ZipFile(archived, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted(packed):
+            archive.writestr(zipfile.ZipInfo(file, _FIXED), packed[file], zipfile.ZIP_DEFLATED)
+    write_bytes(out, archived.getvalue())
     return out
 
 
@@ -149,11 +154,3 @@ def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes
             log.warning("Export of an FMU: the binary is left out: %s.", error)
             return {}
         return {f"binaries/{place}/{library.name}": library.read_bytes()}
-
-
-def _archive(files: Mapping[str, bytes]) -> bytes:
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in sorted(files):
-            archive.writestr(zipfile.ZipInfo(file, _FIXED), files[file], zipfile.ZIP_DEFLATED)
-    return packed.getvalue()

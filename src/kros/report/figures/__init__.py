@@ -1,14 +1,13 @@
 """Figures: one row of one table each, in the order of the paper's argument.
 
-The function of a row takes a `RunFolder` and the options of the row; it returns the figure and more of its caption.
+The function of a row takes a `RunFolder`; it returns the figure and more of its caption.
 """
 
-from collections.abc import Iterator
-from dataclasses import field
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from ...core import ByName, ConfigError, frozen
+from ...core import ConfigError, frozen
 from ..canvas import Figure
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
@@ -16,12 +15,11 @@ from ..theme import style
 
 @frozen
 class Row:
-    """A figure: its title, the module and function that draw it, the first sentence of its caption, and options."""
+    """A figure: its title, the module and function that draw it, and the first sentence of its caption."""
 
     title: str
     function: str
     see: str
-    options: ByName = field(default_factory=dict)
 
 
 _SMALL = "The smaller the error, the better the estimate."
@@ -36,7 +34,7 @@ FIGURES: dict[str, Row] = {
     "weights_entrywise": Row("Weights, entry by entry", "uncertainty:weights_entrywise", "Black bounds blue lines."),
     "synthesis": Row("Plant, weights and filters", "synthesis:bode", "High weights need a large correction."),
     "observers_in_time": Row("Estimates", "episodes:estimates", _SMALL),
-    "observers_in_time_paper": Row("The paper's estimates", "episodes:estimates", _SMALL, {"paper": True}),
+    "observers_in_time_paper": Row("The paper's estimates", "episodes:paper_estimates", _SMALL),
     "loaded_paper": Row("Errors in another condition", "episodes:other_condition", _SMALL),
     "load_torque": Row("Load torque", "load:load_torque", "The nearer to the declared load, the better."),
     "outlier_scores": Row("Outlier scores", "outliers:scores", "The higher a unit, the more it differs."),
@@ -46,22 +44,28 @@ FIGURES: dict[str, Row] = {
 
 @frozen
 class Drawn:
-    """A figure, or the reason why it is left out; `name` is also the name of its file."""
+    """A figure, in the end as SVG, or the reason why it is left out; `name` is also the name of its file."""
 
     name: str
     title: str
     figure: Figure | None = None
     caption: str = ""
     reason: str = ""
+    svg: str = ""
+
+
+def drawing(place: str) -> Callable[..., Any]:
+    """Return the function at a place, its module and its name."""
+    module, _, function = place.partition(":")
+    return getattr(import_module(f".{module}", __name__), function)
 
 
 def draw(name: str, run: RunFolder) -> Drawn:
     """Draw one figure of a run; one that lacks an artifact comes with the reason instead."""
     row = FIGURES[name]
-    module, _, function = row.function.partition(":")
     with style():
         try:
-            figure, text = getattr(import_module(f".{module}", __name__), function)(run, **row.options)
+            figure, text = drawing(row.function)(run)
             return Drawn(name, row.title, figure, f"{row.see} {text}".strip())
         except NotShownError as absent:
             return Drawn(name, row.title, reason=str(absent))
@@ -75,8 +79,3 @@ def run_figure(run: Any, name: str = "observers_in_time") -> Figure:
     if drawn.figure is None:
         raise ConfigError(f"Plot of a run: the figure {name!r} is left out, {drawn.reason}.")
     return drawn.figure
-
-
-def draw_all(run: RunFolder) -> Iterator[Drawn]:
-    """Draw all figures of a run, one at a time."""
-    return (draw(name, run) for name in FIGURES)

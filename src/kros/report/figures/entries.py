@@ -10,17 +10,16 @@ from ...uncertainty import Form
 from ...uncertainty.unit_residuals import UnitResiduals
 from ..canvas import Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note, set_titles
 from ..names import model_label, shorten, words
+from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
 
 Names = tuple[Sequence[str], Sequence[str]]
-_OUTPUT_ROWS = (Form.ADDITIVE, Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
-_OUTPUT_COLUMNS = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_ADDITIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
 
 
 def entry_names(form: Form, models: ModelSet) -> Names:
     """Return the signals behind the rows and the columns of a form's residual."""
     outputs, inputs = models.lifting.names, models.inputs
-    return outputs if form in _OUTPUT_ROWS else inputs, outputs if form in _OUTPUT_COLUMNS else inputs
+    return inputs if form.at_input else outputs, inputs if form.sees_input else outputs
 
 
 def short(name: str) -> str:
@@ -34,9 +33,7 @@ def differing(residuals: UnitResiduals) -> list[int]:
     return [k for k in residuals.rows(inside=True) if residuals.unit_ids[k] != residuals.nominal_id]
 
 
-def entries_figure(
-    residuals_of: Mapping[str, UnitResiduals], names: Mapping[str, Names], alarm: str | None = None
-) -> Figure:
+def entries_figure(run: RunFolder, residuals_of: Mapping[str, UnitResiduals], alarm: str | None = None) -> Figure:
     """Draw entries of all units with their bound and its fit, models side by side or one below the other."""
     sizes = {
         name: (min(r.largest.shape[1], DRAWING.states), min(r.largest.shape[2], DRAWING.states))
@@ -51,9 +48,10 @@ def entries_figure(
     top, left = 0, 0
     for name, residuals in residuals_of.items():
         p, m = sizes[name]
-        _draw_block(axes[top : top + p, left : left + m], residuals, names[name], model_label(name), alarm)
+        names = entry_names(residuals.form, run.models[name])
+        _draw_block(axes[top : top + p, left : left + m], residuals, names, model_label(name), alarm)
         left, top = (left + m, top) if together else (left, top + p)
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure
 
 
@@ -71,9 +69,8 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
             if alarm in residuals.unit_ids:
                 line = levels[residuals.unit_ids.index(str(alarm)), ..., i, j]
                 panel.plot(freqs, line, color=Tone.ALARM, label=f"unit {alarm}")
-            frequency_axis(panel, freqs, "")
-            order = f"order {residuals.entry_orders[i, j]}"
-            note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT)
+            frequency_axis(panel, freqs)
+            note(panel, f"order {residuals.entry_orders[i, j]}", (0, 0), (3, 3), color=Tone.SOFT)
         row[0].set_ylabel(f"to\n{short(names[0][i])}\n(dB)")
     set_titles(block[0], (f"{label},\nfrom {short(name)}" for name in names[1]))
-    label_below(block[-1])
+    label_below(block[-1], "frequency (Hz)")

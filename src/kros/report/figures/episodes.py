@@ -44,22 +44,6 @@ _PAPER = "The paper's observers: mixed H2-H∞ synthesis on models of EDMD. "
 
 
 @frozen
-class Signals:
-    """What the signals of a figure are: channels, sampling period, samples of the enlarged part, gearbox band."""
-
-    channels: Sequence[Channel]
-    sample_period_s: float
-    window: int
-    band_hz: Sequence[float] | None = None
-
-    @classmethod
-    def of(cls, run: RunFolder) -> Signals:
-        """Return those of a run; the enlarged part has some turns of the gearbox, else an eighth of the episode."""
-        size = DRAWING.zoom if run.has("calibration/calibration.json") else len(run.shown[0].time_s) // 8
-        return cls(run.channels, run.sample_period_s, size, run.evaluation.get("band_hz"))
-
-
-@frozen
 class Block:
     """One episode in a figure: its title, what is drawn beside the recorded signals, and of which states."""
 
@@ -82,7 +66,7 @@ def free_run(run: RunFolder) -> Captioned:
 
 def estimates(run: RunFolder, paper: bool = False) -> Captioned:
     """Draw estimates for the nominal and the worst off-nominal unit (the paper's Figures 11 and 12)."""
-    shown = [s for s in run.shown if s.key.condition == run.identify_on][:2]
+    shown = [s for s in run.shown if s.key.condition == run.facts.identify_on][:2]
     if not shown or not shown[0].observers:
         raise NotShownError("no observer was run on the episodes that are shown")
     known = shown[0].observers
@@ -101,15 +85,20 @@ def estimates(run: RunFolder, paper: bool = False) -> Captioned:
 
 def other_condition(run: RunFolder) -> Captioned:
     """Draw the paper's observers, or the deployed one, in a condition that no model has seen (Figures 13 and 14)."""
-    shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
+    shown = next((s for s in run.shown if s.key.condition != run.facts.identify_on), None)
     if shown is None or not shown.observers:
         raise NotShownError("the recordings have one condition only")
     pair = observer_pair(published(shown.observers))
     names = pair or observer_pair(shown.observers, run.deployed)
     block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), DRAWING.states)))
     text = _PAPER if pair else ""
-    text += f"Designed in “{condition_label(run.identify_on)}” alone; errors are recorded minus estimated values."
+    text += f"Designed in “{condition_label(run.facts.identify_on)}” alone; errors are recorded minus estimated values."
     return _figure(run, [block], text)
+
+
+def paper_estimates(run: RunFolder) -> Captioned:
+    """Draw estimates of the paper's observers."""
+    return estimates(run, paper=True)
 
 
 def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[int]) -> Block:
@@ -118,35 +107,42 @@ def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[i
 
 
 def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> Captioned:
-    """Return the figure of some episodes of a run and its caption."""
-    signals = Signals.of(run)
-    text += " Shaded: the band around the gearbox frequency at top speed." if signals.band_hz else ""
-    return blocks_figure(signals, blocks), text
+    """Return the figure of some episodes of a run and its caption; enlarged are some turns of the gearbox, or less."""
+    band_hz, samples = run.evaluation.get("band_hz"), len(run.shown[0].states)
+    size = DRAWING.zoom if run.has("calibration/calibration.json") else samples // 8
+    text += " Shaded: the band around the gearbox frequency at top speed." if band_hz else ""
+    return blocks_figure(run.channels, blocks, size, band_hz), text
 
 
-def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:
-    """Draw a row a state: the episode, a part of it, the error over time, and the error's power spectral density."""
+def blocks_figure(
+    channels: Sequence[Channel], blocks: Sequence[Block], size: int, band_hz: Sequence[float] | None = None
+) -> Figure:
+    """Draw a row a state: the episode, `size` samples of it, the error over time, and its power spectral density."""
     figure, axes = grid(sum(len(block.states) for block in blocks), 4)
     first = 0
     for block in blocks:
         panels = axes[first : first + len(block.states)]
         first += len(block.states)
-        window = steady_window(signals, block.shown)
+        window = steady_window(channels, block.shown, size)
         for row, i in zip(panels, block.states, strict=True):
-            _draw_state(signals, row, block, i, window)
-        label_rows(panels[:, 0], [signals.channels[i] for i in block.states])
-        hide_times(panels[:-1, :3].ravel())
+            _draw_state(row, block, i, window)
+            row[3].set_ylabel(f"{squared(channels[i].unit)}/Hz", size="small")
+            if band_hz is not None:
+                row[3].axvspan(*band_hz, color=Tone.GRID, lw=0, zorder=0.5)
+        label_rows(panels[:, 0], [channels[i] for i in block.states])
+        for panel in panels[:-1, :3].ravel():
+            panel.tick_params(labelbottom=False)
         label_below(panels[-1, :3], "time (s)")
         set_titles(panels[0, [0, 2, 3]], (block.title, "error", "PSD of the error"))
-    label_below(axes[-1, 3:])
     figure.align_ylabels(axes[:, 0])
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure
 
 
-def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, window: slice) -> None:
+def _draw_state(row: Sequence[Axes], block: Block, i: int, window: slice) -> None:
     """Draw one state of an episode in four panels."""
-    time_s, recorded = block.shown.time_s, block.shown.states[:, i].astype(float)
+    shown = block.shown
+    time_s, recorded = shown.time_s, shown.states[:, i].astype(float)
     start = int(DRAWING.settled * len(recorded))
     for panel, part in ((row[0], slice(None)), (row[1], window)):
         draw_line(panel, time_s[part], recorded[part], TRUTH, "recorded")
@@ -157,13 +153,10 @@ def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, win
         error = recorded - values[:, i].astype(float)
         if np.isfinite(error).all() and np.abs(error[start:]).max() < DRAWING.diverged * np.ptp(recorded):
             draw_line(row[2], time_s[start:], error[start:], look)
-            freqs, density = error_spectrum(error, signals.sample_period_s)
+            freqs, density = error_spectrum(error, shown.sample_period_s)
             row[3].plot(freqs[1:], density[1:], look.style, color=look.colour)
-            frequency_axis(row[3], freqs, "")
+            frequency_axis(row[3], freqs)
     logarithmic(row[3])
-    row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size="small")
-    if signals.band_hz is not None:
-        row[3].axvspan(*signals.band_hz, color=Tone.GRID, lw=0, zorder=0.5)
 
 
 def _inside(values: AnyArray, recorded: AnyArray) -> AnyArray:
@@ -189,12 +182,6 @@ def label_rows(axes: Iterable[Axes], channels: Sequence[Channel]) -> None:
         row.set_ylabel("\n".join([*lines, *([f"({unit})"] if unit else [])]))
 
 
-def hide_times(rows: Iterable[Axes]) -> None:
-    """Drop the numbers of time axes that are repeated below."""
-    for axes in rows:
-        axes.tick_params(labelbottom=False)
-
-
 def references(channels: Sequence[Channel]) -> dict[str, int]:
     """Return for every state the input column that is its reference, by the name ``target_<state>``."""
     inputs = [c.name for c in channels if c.role is Role.INPUT]
@@ -202,10 +189,10 @@ def references(channels: Sequence[Channel]) -> dict[str, int]:
     return {name: inputs.index(f"target_{name}") for name in states if f"target_{name}" in inputs}
 
 
-def steady_window(signals: Signals, shown: Shown) -> slice:
+def steady_window(channels: Sequence[Channel], shown: Shown, size: int) -> slice:
     """Return a window that begins where the reference is fastest, in the middle of the episode where there is none."""
-    columns, samples = references(signals.channels), len(shown.time_s)
-    size = max(min(signals.window, samples), 2)
+    columns, samples = references(channels), len(shown.states)
+    size = max(min(size, samples), 2)
     first = np.abs(shown.inputs[:, columns["velocity"]]).argmax() if "velocity" in columns else (samples - size) // 2
     begin = min(int(first), samples - size)
     return slice(begin, begin + size)
@@ -234,9 +221,9 @@ def compare_figure(
     """Draw simulations from the first recorded states beside the recording, with their fit in percent."""
     key = shown_episode(models, unit, condition)
     names = [model] if model else sorted(models.edmd_kinds if condition else models.kinds, key=is_koopman)
-    held_out = HeldOut(models.population, (key,), models.parameters, shown=(0,))
+    held_out = HeldOut(models.population, (key,), models.parameters, shown=(key,))
     batch = held_out.read([key])
-    runs = [held_out.models(models.models(name, condition)).shown[0] for name in names]
+    runs = [held_out.models(models.models(name, condition)).shown[key] for name in names]
     lines = {model_label(name): (values, model_look(name)) for name, values in zip(names, runs, strict=True)}
     figure = _episode_figure(models.population, batch, lines)
     figure.axes[0].set_title(f"{episode_title(key)}\n")  # above the fits, which stand beside it
@@ -264,7 +251,6 @@ def design_figure(
 def _episode_figure(population: Population, batch: EpisodeBatch, lines: Lines) -> Figure:
     """Draw all states of one episode beside what was estimated or simulated."""
     (key,), states = batch.keys, batch.states[:, 0]
-    time_s = np.arange(len(states)) * batch.sample_period_s
-    shown = Shown(key, time_s, states, batch.inputs[:, 0], {}, {})
+    shown = Shown(key, batch.sample_period_s, states, batch.inputs[:, 0])
     block = Block(episode_title(key), shown, lines, range(states.shape[1]))
-    return blocks_figure(Signals(population.channels, batch.sample_period_s, len(time_s) // 8), [block])
+    return blocks_figure(population.channels, [block], len(states) // 8)

@@ -10,7 +10,7 @@ from ..canvas import Captioned, frequency_axis, grid, legend, logarithmic, set_t
 from ..names import in_condition, model_label, model_look
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING
-from .episodes import TRUTH, draw_line, hide_times
+from .episodes import TRUTH, draw_line
 
 _WAYS = (("load", "load state"), ("current", "error of the\nrecorded current"))
 
@@ -37,12 +37,10 @@ def load_torque(run: RunFolder) -> Captioned:
             spectrum.plot(freqs[1:], error[1:], color=look.colour)
         time.set_ylabel(label)
         logarithmic(spectrum)
-        frequency_axis(spectrum, freqs, "")
-    hide_times(axes[:-1].ravel())
+        frequency_axis(spectrum, freqs)
     set_titles(axes[0], ("in units of current", "PSD of load and errors, 1/Hz"))
     axes[-1, 0].set_xlabel("time (s)")
-    axes[-1, 1].set_xlabel("frequency (Hz)")
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     unit, condition, _ = content["shown"]
     parts = [f"{r['observer']} {r['error_percent']:.0f} % of the load" for r in content["rows"]]
     text = f"Unit {unit}{in_condition(condition)}. Errors below 5 Hz over all units whose load was not known: "

@@ -36,7 +36,7 @@ def identified_step(models: IdentifiedModels, model: str | None = None, conditio
 def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
     """Draw magnitude beside phase, a row a state and a pair of columns an input; the unit `nominal` stands out."""
     freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
-    response = models.systems().frequency_response(freqs) * (models.input_scale / models.output_scale[:, None])
+    response = models.scaled_responses(freqs)
     rows, inputs = min(response.shape[2], DRAWING.states), min(response.shape[3], 2)
     values = (decibel(response), np.degrees(np.unwrap(np.angle(response), axis=1)))
     figure, axes = grid(rows, 2 * inputs, sharex=True)
@@ -45,12 +45,12 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
         lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
         if nominal in models.unit_ids:
             panel.plot(freqs, lines[models.index(nominal)], color=Tone.INK, label=f"nominal, unit {nominal}")
-        frequency_axis(panel, freqs, "frequency (Hz)" if i == rows - 1 else "")
+        frequency_axis(panel, freqs)
         panel.locator_params(axis="y", nbins=4)
         panel.set_ylabel("" if j else short(models.lifting.names[i]))
     for j, panel in enumerate(axes[0]):
         panel.set_title(f"{words(models.inputs[j // 2])}:\n{'phase (°)' if j % 2 else 'magnitude (dB)'}")
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure
 
 
@@ -67,7 +67,7 @@ def step_figure(models: ModelSet) -> Figure:
     set_titles(axes[0], (f"{short(name)}:\nstep of 1 {units.get(name, '')}" for name in inputs))
     label_rows(axes[:, 0], channels)
     label_below(axes[-1], "time (s)")
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure
 
 
@@ -95,5 +95,5 @@ def residuals_figure(
         panels[0].set_ylabel(short(name))
     set_titles(axes[0], (f"residual with\n{short(name)}" for name in ("itself", *chosen.recorded_inputs)))
     label_below(axes[-1], "lag (samples)")
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure

@@ -6,18 +6,17 @@ import numpy as np
 
 from ...data import natural_key, some
 from ...uncertainty import OutlierModel
-from ..canvas import Axes, Captioned, Figure, grid, name_units, note, units_axis
+from ..canvas import Axes, Captioned, grid, name_units, note, units_axis
 from ..names import condition_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
-from ..unit_verdicts import Check
 
 
 def scores(run: RunFolder) -> Captioned:
     """Draw one point a unit with its range, flagged ones in the colour of alarm, a column a condition."""
-    models = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
-    first = next(iter(models.values()))
-    flagged = sorted({s.unit for m in models.values() for s in m.scores if s.outlier}, key=natural_key)
+    models = dict(sorted(run.outlier_models.items(), key=lambda item: natural_key(item[0])))
+    first, scores = next(iter(models.values())), [score for model in models.values() for score in model.scores]
+    flagged = sorted({score.unit for score in scores if score.outlier}, key=natural_key)
     about = (
         f"Excess of the largest {words(first.form.value)} residual of a unit over those of all others: median over all "
         "nominal units, and as a bar the range over them"
@@ -28,7 +27,7 @@ def scores(run: RunFolder) -> Captioned:
     text += f"Above it: {some(flagged)}." if flagged else "No unit is above it."
     if not any(np.isfinite(m.threshold_db) for m in models.values()):
         text = f"{about}. There is no threshold with fewer than eight units."
-    units = sorted({s.unit for m in models.values() for s in m.scores}, key=natural_key)
+    units = sorted({score.unit for score in scores}, key=natural_key)
     figure, axes = grid(1, len(models), sharey=True)
     for panel, (condition, model) in zip(axes[0], models.items(), strict=True):
         _panel(panel, model, units)
@@ -43,8 +42,8 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
     for score in model.scores:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
-        ends = [score.lowest_db + shift, score.highest_db + shift]
-        axes.plot([place, place], ends, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
+        ends = score.lowest_db + shift, score.highest_db + shift
+        axes.plot([place] * 2, ends, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
         (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone)
         name_units(point, [score.unit])
         if score.outlier or score is highest:
@@ -53,21 +52,3 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         axes.axhline(model.threshold_db, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
         text = f"threshold, {number(model.threshold_db)} dB"
         note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")
-
-
-def check_figure(check: Check) -> Figure:
-    """Draw the scores of new units, or the levels of their innovations, beside the threshold, a column a condition."""
-    conditions = sorted({row["condition"] for row in check.rows}, key=natural_key)
-    figure, axes = grid(1, len(conditions), sharey=True)
-    for panel, condition in zip(axes[0], conditions, strict=True):
-        rows = [row for row in check.rows if row["condition"] == condition]
-        for place, row in enumerate(rows):
-            scored = row["score"] is not None
-            value, threshold = (row["score"], row["threshold"]) if scored else (row["level_db"], 0.0)
-            ends = np.array([value, threshold], dtype=float)  # none is NaN
-            panel.plot(place, ends[0], "o", color=Tone.ALARM if row["outlier"] else Tone.BLUE)
-            panel.plot([place - 0.4, place + 0.4], ends[[1, 1]], color=Tone.SOFT, ls="--")
-        panel.set_title(condition_label(condition))
-        units_axis(panel, [row["unit"] for row in rows])
-    axes[0, 0].set_ylabel("score and threshold (dB)")
-    return figure

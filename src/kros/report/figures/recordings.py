@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import compress
+
 import numpy as np
 
 from ...core import AnyArray, ConfigError
@@ -26,7 +29,7 @@ from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, HUES, Tone
 from .entries import short
-from .episodes import draw_line, hide_times, label_rows, references, steady_stretches
+from .episodes import draw_line, label_rows, references, steady_stretches
 
 _RECORDED, _REFERENCE = Look(Tone.INK), Look(Tone.GOLD, weight=3, opacity=0.5)
 
@@ -34,7 +37,7 @@ _RECORDED, _REFERENCE = Look(Tone.INK), Look(Tone.GOLD, weight=3, opacity=0.5)
 def recorded_episodes(run: RunFolder) -> list[Shown]:
     """Return one held-out episode of one unit in every condition, the condition of the models first."""
     episodes = [s for s in run.shown if s.key.unit == run.shown[0].key.unit]
-    return sorted(episodes, key=lambda s: s.key.condition != run.identify_on)
+    return sorted(episodes, key=lambda s: s.key.condition != run.facts.identify_on)
 
 
 def signals(run: RunFolder) -> Captioned:
@@ -48,11 +51,10 @@ def signals(run: RunFolder) -> Captioned:
                 draw_line(column[i], episode.time_s, reference, _REFERENCE, "reference")
             draw_line(column[i], episode.time_s, episode.states[:, i], _RECORDED, "recorded")
         column[0].set_title(episode_title(episode.key))
-        hide_times(column[:-1])
     label_rows(axes[:, 0], channels)
     label_below(axes[-1], "time (s)")
     figure.align_ylabels(axes[:, 0])
-    legend(figure, axes[0, 0])
+    legend(axes[0, 0])
     return figure, "The same unit in two conditions." if len(shown) == 2 else ""
 
 
@@ -93,10 +95,10 @@ def excitation_figure(population: Population, unit: str | None = None, condition
         for name, line, tone in zip(population.states, coherence[i], HUES, strict=False):
             right.plot(freqs[1:], line[1:], color=tone, label=words(name))
         right.set_ylim(0, 1.05)
-        frequency_axis(left, freqs, "")
+        frequency_axis(left, freqs)
+        frequency_axis(right, freqs)
     set_titles(axes[0], (f"PSD, {len(keys)} episodes of unit {keys[0].unit}", "coherence with states"))
-    label_below(axes[-1])
-    legend(figure, axes[0, 1])
+    legend(axes[0, 1])
     return figure
 
 
@@ -119,7 +121,7 @@ def tracking_spectrum(run: RunFolder) -> Captioned:
     panel.set_xlabel("frequency (Hz)")
     unit = next(c.unit for c in run.channels if c.name == spec.measured)
     panel.set_ylabel(f"{spec.measured} error,\nPSD ({squared(unit)}/Hz)")
-    legend(figure, panel)
+    legend(panel)
     text = f"{words(spec.reference)} minus {words(spec.measured)} at the highest speed. Dotted: {frequency:.3g} Hz, "
     return figure, text + f"which is {spec.ratio:g} times the speed, and its multiples."
 
@@ -143,31 +145,26 @@ def _tracking(run: RunFolder, shown: Shown) -> tuple[AnyArray, AnyArray, float]:
 def phase(run: RunFolder) -> Captioned:
     """Draw the phase calibration of a run (Appendix B)."""
     calibration = run.calibration
-    lags = np.degrees([c.lag_rad for u, c in calibration.units.items() if u not in run.set_aside])
+    lags = np.degrees([c.lag_rad for u, c in calibration.units.items() if u in run.facts.pooled])
     weak = [u for u, c in calibration.units.items() if c.concentration < DRAWING.concentrated]
     mean, low, high = (minus(f"{value:.0f}°") for value in (np.mean(lags), lags.min(), lags.max()))
     text = f"The lag of the loop is {mean} in the mean, from {low} to {high}."
     text += f" Concentration below {DRAWING.concentrated:g}: {some(weak)}." if weak else ""
-    return phase_figure(calibration, run.set_aside), text
+    return phase_figure(calibration, run.facts.pooled), text
 
 
-def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = None) -> Figure:
+def phase_figure(calibration: PhaseCalibration, pooled: Sequence[str]) -> Figure:
     """Draw phase, lag and concentration of every unit; units that are set aside are drawn hollow."""
-    units = list(calibration.units)
-    values = [calibration.units[u] for u in units]
+    units, values = list(calibration.units), calibration.units.values()
     figure, axes = grid(1, 3)
-    columns = (
-        (np.degrees([v.phase_rad for v in values]), "phase (°)"),
-        (np.degrees([v.lag_rad for v in values]), "lag (°)"),
-        (np.array([v.concentration for v in values]), "concentration"),
-    )
-    places, inside = np.arange(len(units)), np.array([u not in (set_aside or []) for u in units])
-    for (column, label), panel in zip(columns, axes[0], strict=True):
-        for chosen, look in ((inside, {}), (~inside, {"mfc": "none"})):
-            (drawn,) = panel.plot(places[chosen], column[chosen], "o", ms=4, color=Tone.BLUE, **look)
-            name_units(drawn, [u for u, mark in zip(units, chosen, strict=True) if mark])
-        panel.set_title(label)
+    columns = np.array([(np.degrees(v.phase_rad), np.degrees(v.lag_rad), v.concentration) for v in values]).T
+    inside = np.isin(units, pooled)
+    for column, panel in zip(columns, axes[0], strict=True):
+        for chosen, face in ((inside, Tone.BLUE), (~inside, "none")):
+            (drawn,) = panel.plot(*np.nonzero(chosen), column[chosen], "o", ms=4, color=Tone.BLUE, mfc=face)
+            name_units(drawn, compress(units, chosen))
         units_axis(panel, units)
+    set_titles(axes[0], ("phase (°)", "lag (°)", "concentration"))
     axes[0, 0].set_yticks([0, 180, 360])
     axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT, lw=DRAWING.thin, ls="--")
     axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT, lw=DRAWING.thin, ls="--")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +11,8 @@ from ...design.task import split_name
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis
 from ..canvas import Captioned, decibel, frequency_axis, grid, legend
-from ..names import label_of, method_look, model_label
+from ..facts import grouped
+from ..names import label_of, linear_first, method_look, model_label
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone
 
@@ -20,28 +21,27 @@ Curve = tuple[str, AnyArray, str, str]
 
 def bode(run: RunFolder) -> Captioned:
     """Draw largest singular values of plant, weights and filters, linear beside Koopman (the paper's Figure 10)."""
-    designed = {n: s for n, s in run.syntheses.items() if not label_of(n).baseline}
-    robust = {n: s for n, s in designed.items() if split_name(n)[1] != "estimator"}  # which corrects no model
-    chosen = [m for m in run.models if any(n.startswith(f"{m}/") for n in robust)]
-    if not chosen:
+    designed = [n for n in run.syntheses if not label_of(n).baseline]
+    robust = [n for n in designed if split_name(n)[1] != "estimator"]  # which corrects no model
+    if not robust:
         raise NotShownError("no robust observer has been synthesized")
+    chosen = linear_first(grouped(robust, lambda name: split_name(name)[0]))
     figure, axes = grid(1, len(chosen), sharey=True)
-    for panel, name in zip(axes[0], chosen, strict=True):
+    for panel, (name, observers) in zip(axes[0], chosen.items(), strict=True):
         freqs = run.models[name].frequencies(DRAWING.frequencies, decades=DRAWING.decades)
-        syntheses = {n: s for n, s in robust.items() if n.startswith(f"{name}/")}
-        for label, response, colour, line in _curves(run, name, syntheses, freqs):
+        for label, response, colour, line in _curves(run, name, observers, freqs):
             size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
             if np.isfinite(size).any():  # not of a filter that is zero
                 panel.plot(freqs, size, line, color=colour, label=label)
         panel.axhline(0, color=Tone.SOFT, lw=DRAWING.thin)
         frequency_axis(panel, freqs)
         panel.set_title(model_label(name))
-    legend(figure, max(axes[0], key=lambda panel: len(panel.lines)), 4)
+    legend(max(axes[0], key=lambda panel: len(panel.lines)), 4)
     axes[0, 0].set_ylabel("largest singular value (dB)")
     return figure, "Every signal over its largest value. K maps the innovation to the correction."
 
 
-def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis], freqs: AnyArray) -> list[Curve]:
+def _curves(run: RunFolder, name: str, observers: Sequence[str], freqs: AnyArray) -> list[Curve]:
     """Return responses with their label, colour and style."""
     models = run.models[name]
     curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY, "-")]
@@ -49,9 +49,9 @@ def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis], freqs
         weight = run.uncertain[name].weight
         curves.append(("W left", weight.left.frequency_response(freqs), Tone.GOLD, "-"))
         curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN, "--"))
-    for observer, synthesis in syntheses.items():
-        response, look = scaled_filter(synthesis, models).frequency_response(freqs), method_look(observer)
-        curves.append((f"K {label_of(observer).text}", response, look.colour, look.style))
+    for observer in observers:
+        K, look = scaled_filter(run.syntheses[observer], models), method_look(observer)
+        curves.append((f"K {label_of(observer).text}", K.frequency_response(freqs), look.colour, look.style))
     return curves
 
 

@@ -19,9 +19,7 @@ from ..canvas import (
     decibel,
     frequency_axis,
     grid,
-    label_below,
     legend,
-    line_over_shade,
     lines_of_units,
     note,
     set_titles,
@@ -29,7 +27,7 @@ from ..canvas import (
 from ..names import model_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, HUES, Tone
-from .entries import differing, entries_figure, entry_names
+from .entries import differing, entries_figure
 
 FORM_TONES = {
     Form.ADDITIVE: Tone.INK,
@@ -40,13 +38,12 @@ FORM_TONES = {
     Form.INVERSE_OUTPUT_MULTIPLICATIVE: Tone.ORANGE,
 }
 _PUBLISHED = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  # the input forms agree for tall plants
-_INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 
 
 def forms(run: RunFolder) -> Captioned:
     """Draw the largest residuals in all forms, linear beside Koopman (the paper's Figure 7)."""
     chosen = run.uncertain
-    tall = {n: m for n, m in chosen.items() if n in run.models and len(m.output_scale) > len(m.input_scale)}
+    tall = {n: m for n, m in chosen.items() if len(m.output_scale) > len(m.input_scale)}
     published = {n: published_bounds(m, run.models[n]) for n, m in tall.items()}  # these contain the identity
     used = words(next(iter(chosen.values())).form.value)
     text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
@@ -58,7 +55,7 @@ def forms(run: RunFolder) -> Captioned:
             panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form])
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
-    legend(figure, axes[0, 0], 3)
+    legend(axes[0, 0], 3)
     return figure, text
 
 
@@ -66,10 +63,13 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
     """Return frequencies and bounds of the output forms as published."""
     freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.frequencies)]
     response = models.scaled_responses(freqs, model.unit_ids)
-    rows = {form: model.nominals.get(form) for form in _PUBLISHED}
-    nominals = {f: model.unit_ids.index(unit) if unit in model.unit_ids else 0 for f, unit in rows.items()}
-    sizes = {f: sigma_max(residual(f, response[row], response, paper=True)) for f, row in nominals.items()}
-    return {f: (freqs, np.delete(size, nominals[f], axis=0).max(axis=0)) for f, size in sizes.items()}
+    bounds = dict[Form, tuple[AnyArray, AnyArray]]()
+    for form in _PUBLISHED:
+        unit = model.nominals.get(form)
+        row = model.unit_ids.index(unit) if unit in model.unit_ids else 0
+        size = sigma_max(residual(form, response[row], response, paper=True))
+        bounds[form] = freqs, np.delete(size, row, axis=0).max(axis=0)
+    return bounds
 
 
 def draw_forms(axes: Axes, model: UncertainModel) -> None:
@@ -96,11 +96,11 @@ def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResidu
     """Draw the weights of a kind of model, and every unit relative to them, a row a kind."""
     figure, axes = grid(len(rows), 3, sharex=True)
     for row, (name, (model, models, residuals)) in zip(axes, rows.items(), strict=True):
-        _draw_weights(row, model, models.inputs if model.form in _INPUT_SIDE else ())
+        both = model.form.at_input and model.form.sees_input
+        _draw_weights(row, model, models.inputs if both else ())
         ratio_panel(row[2], residuals)
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
     set_titles(axes[0], ("left weight", "right weight", "units relative to the weights"))
-    label_below(axes[-1])
     return figure
 
 
@@ -109,9 +109,8 @@ def uncertain_figure(model: UncertainModel) -> Figure:
     figure, axes = grid(1, 3, sharex=True)
     _draw_weights(axes[0], model)
     draw_forms(axes[0, 2], model)
-    legend(figure, axes[0, 2], 3)
+    legend(axes[0, 2], 3)
     set_titles(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"))
-    label_below(axes[0])
     return figure
 
 
@@ -136,9 +135,11 @@ def _side(axes: Axes, freqs_hz: AnyArray, magnitudes: AnyArray, cover: AnyArray,
     columns = range(magnitudes.shape[1])
     labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
     for i, tone in zip(columns, HUES, strict=False):
-        line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone)
+        shade, line = decibel(cover[:, i]), decibel(magnitudes[:, i])
+        axes.plot(freqs_hz, shade, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
+        axes.plot(freqs_hz, line, color=tone)
         note(axes, words(labels[i]), (0, 1), (4, -10 * i - 1), va="top", color=tone)
-    frequency_axis(axes, freqs_hz, "")
+    frequency_axis(axes, freqs_hz)
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
     axes.set_ylim(low, high + (high - low) * len(columns) / 4)
 
@@ -149,32 +150,30 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     levels = decibel(residuals.ratio)[rows]
     names = [residuals.unit_ids[k] for k in rows]
     lines_of_units(axes, freqs, levels, Tone.BLUE, "units", names)
-    first = int(np.nanargmax(np.nanmax(np.where(np.isfinite(levels), levels, -np.inf), axis=1)))
+    first = int(np.where(np.isfinite(levels), levels, -np.inf).max(axis=1).argmax())
     axes.plot(freqs, levels[first], color=Tone.INK)
     note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK)
     axes.axhline(0, color=Tone.ALARM, lw=DRAWING.thin, ls="--")
-    frequency_axis(axes, freqs, "")
+    frequency_axis(axes, freqs)
 
 
 def weights_entrywise(run: RunFolder) -> Captioned:
     """Draw residuals entry by entry with their fitted weights (the paper's Figure 8 as published)."""
     chosen = run.unit_residuals
-    names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
     first = next(iter(chosen.values()))
     text = f"Magnitudes of the entries of all {words(first.form.value)} residuals relative to unit {first.nominal_id}. "
     excess = [f"{number(r.entry_excess)} ({model_label(n)})" for n, r in chosen.items() if r.entry_excess > 1]
     text += "Bounds of entries do not bound a full perturbation"
     text += f": σmax(W⁻¹E) reaches {' and '.join(excess)}." if excess else "."
-    return entries_figure(chosen, names), text
+    return entries_figure(run, chosen), text
 
 
 def outlier_residuals(run: RunFolder) -> Captioned:
     """Draw the residual of the highest-scoring unit beside those of the others (the paper's Figure 15)."""
     first = next(iter(run.others.values()))
     unit = first.outside[0]
-    names = {n: entry_names(r.form, run.models[n]) for n, r in run.others.items()}
     text = f"Entries of the {words(first.form.value)} residuals relative to unit {first.nominal_id}, weights fitted to "
-    return entries_figure(run.others, names, alarm=unit), text + f"all units but {unit}."
+    return entries_figure(run, run.others, alarm=unit), text + f"all units but {unit}."
 
 
 def sets_figure(models: UncertainModels, model: str | None = None) -> Figure:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
+from ...core import ByName
 from ...core.linalg import radius_text
 from ...design.task import split_name
-from ..content import Column, Section, Table, build
-from ..error_tables import ErrorCell
+from ..content import Column, Row, Section, Table, build
 from ..facts import Facts
-from ..names import axis_label, label_of, minus, observer_label
+from ..names import label_of, minus, observer_label
 
 _TEXT = (
     "For the set of plants: a bound on the H2 norm of the error for every plant between the weights, and a lower bound "
@@ -48,30 +47,31 @@ def certificates(facts: Facts) -> Section | None:
 
 def _table(facts: Facts) -> Table | None:
     """Return one row an observer with a model."""
-    entries = {n: e for n, e in facts.observers.items() if e.get("status") != "failed" and split_name(n)[0]}
-    rows, errors = list(entries.values()), facts.tables[0].cells if facts.tables else {}
-    robust = [not label_of(n).baseline for n in entries]  # a baseline's optimum bounds no worst case
-    bounds = [e.get("lower_bound") or None if r else None for e, r in zip(rows, robust, strict=True)]
-    gaps = [e.get("gap_percent") if b else None for e, b in zip(rows, bounds, strict=True)]
-    radii = [e.get("spectral_radius_max") for e in rows]
+    rows, errors = list[Row](), facts.tables[0].cells if facts.tables else {}
+    for name, entry in facts.observers.items():
+        if entry.get("status") == "failed" or not split_name(name)[0]:
+            continue
+        radius, lower = entry.get("spectral_radius_max"), not label_of(name).baseline and entry.get("lower_bound")
+        row: Row = {"observer": observer_label(name), "radius": radius and minus(radius_text(radius)), **entry}
+        row |= {} if lower else {"lower_bound": None, "gap_percent": None}  # a baseline's optimum bounds no worst case
+        row |= {("bound", c): bound for c, bound in (entry.get("set_bound") or {}).items()}
+        rows.append(row | {("worst", c): cell.worst_rms for c, cell in errors.get(name, {}).items()})
     columns = [
-        Column("observer", [observer_label(name) for name in entries]),
-        Column("states of the filter", [e.get("order") for e in rows]),
-        Column("spectral radius", [None if r is None else minus(radius_text(r)) for r in radii]),
-        Column("H2 norm at most", [e.get("worst_case_h2") for e in rows], "set of plants"),
-        Column("lower bound", bounds, "set of plants"),
-        Column("gap (%)", gaps, "set of plants"),
+        Column("observer"),
+        Column("states of the filter", "order"),
+        Column("spectral radius", "radius"),
+        Column("H2 norm at most", "worst_case_h2", "set of plants"),
+        Column("lower bound", "lower_bound", "set of plants"),
+        Column("gap (%)", "gap_percent", "set of plants"),
     ]
-    for channel in dict.fromkeys(c for e in rows for c in e.get("set_bound") or {} if c not in facts.measured):
-        worst = [errors.get(n, {}).get(channel, ErrorCell()).worst_rms for n in entries]
-        group = f"recorded signals: {axis_label(channel, facts.unit(channel))}"
-        columns.append(Column("bound", [(e.get("set_bound") or {}).get(channel) for e in rows], group))
-        columns.append(Column("worst RMS error", worst, group))
-    columns.append(Column("gain at most", [e.get("relift_gain") for e in rows], "at run time"))
-    return build("Certificates of all observers", columns, facts.label, sortable=True)
+    for channel in dict.fromkeys(c for row in rows for c in row.get("set_bound") or {} if c not in facts.measured):
+        group = f"recorded signals: {facts.axis(channel)}"
+        columns += [Column("bound", ("bound", channel), group), Column("worst RMS error", ("worst", channel), group)]
+    columns.append(Column("gain at most", "relift_gain", "at run time"))
+    return build("Certificates of all observers", columns, rows, facts.label, sortable=True)
 
 
-def _reasons(entries: Mapping[str, Mapping[str, Any]]) -> Table | None:
+def _reasons(entries: Mapping[str, ByName]) -> Table | None:
     """Return why an observer could not be designed or certified; observers with the same reason share a row."""
     reasons = dict[tuple[str, str], list[str]]()
     for name, entry in entries.items():
@@ -80,9 +80,6 @@ def _reasons(entries: Mapping[str, Mapping[str, Any]]) -> Table | None:
             if entry.get(key):
                 text = "; ".join(dict.fromkeys(entry[key].split("; ")))
                 reasons.setdefault((kind, text), []).append(observer_label(name))
-    columns = [
-        Column("observer", ["; ".join(names) for names in reasons.values()]),
-        Column("without", [kind for kind, _ in reasons]),
-        Column("reason", [text for _, text in reasons]),
-    ]
-    return build("Without a certificate, and why", columns, prose=True, folded=True)
+    rows = [{"observer": "; ".join(of), "without": kind, "reason": text} for (kind, text), of in reasons.items()]
+    columns = [Column("observer"), Column("without"), Column("reason")]
+    return build("Without a certificate, and why", columns, rows, prose=True, folded=True)

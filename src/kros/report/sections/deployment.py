@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ...core import ByName
-from ..content import Column, Section, Table, build
+from ..content import Column, Row, Section, Table, build
 from ..facts import Facts
-from ..names import axis_label, joined, label_of, number, words
+from ..names import joined, label_of, number, words
 
 _ERRORS = {
     "noise": "white noise, standard deviation",
@@ -28,26 +28,31 @@ def deployment(facts: Facts) -> Section | None:
     about = label_of(facts.deployed).about
     about = f": {about}" if about else ""
     assumed = "; ".join(facts.entry.get("assumptions") or ())
+    entry = facts.get("deployment")
     card = [
         ("Observer", [f"{facts.label}{about} (observers/deployed.json)."]),
-        *(_interface(facts, facts.get("deployment")) if facts.get("deployment") else []),
+        *(_interface(facts, entry) if entry else []),
         ("Certificate assumes", [f"{assumed[0].upper()}{assumed[1:]}."] if assumed else []),
         ("Next unit", _next_unit(facts.get("next_unit"))),
         ("Monitor", _monitor(facts.entry.get("monitor"))),
     ]
-    table = _needed(facts, facts.get("deployment", {}))
+    table = _needed(facts, entry)
     texts = [_GAINS] if table is not None else []
     return Section("deployment", "Deployment", texts, [(term, of) for term, of in card if of], [table])
 
 
 def _needed(facts: Facts, entry: ByName) -> Table | None:
     """Return the errors of measurements that cost one percent in each estimate; None where no gain is known."""
-    rows = [(c, kind, of) for c, kinds in entry.get("sensor_gains", {}).items() for kind, of in kinds.items()]
-    columns = [Column("error", [f"{axis_label(c, facts.unit(c))}: {_ERRORS[kind]}" for c, kind, _ in rows])]
-    for state in (s for s in entry.get("estimates", ()) if s not in entry["measured"]):
-        sizes = [entry["largest"][c] / (100 * of[state]) if of[state] else None for c, _, of in rows]
-        columns.append(Column(words(state), sizes))
-    return build("Error of a measurement that costs 1 % of the largest value of an estimate", columns)
+    rows = list[Row]()
+    for channel, kinds in entry.get("sensor_gains", {}).items():
+        share = entry["largest"][channel] / 100
+        for kind, gains in kinds.items():
+            sizes = {state: share / gain for state, gain in gains.items() if gain}
+            rows.append({"error": f"{facts.axis(channel)}: {_ERRORS[kind]}", **sizes})
+    columns = [Column(words(state), state) for state in entry.get("estimates", ()) if state not in entry["measured"]]
+    return build(
+        "Error of a measurement that costs 1 % of the largest value of an estimate", [Column("error"), *columns], rows
+    )
 
 
 def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
@@ -56,9 +61,9 @@ def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
 
     def named(names: Sequence[str]) -> str:
         sizes = {n: f" up to {number(largest[n])}" if n in largest else "" for n in names}
-        return joined([axis_label(n, facts.unit(n)) + sizes[n] for n in names])
+        return joined([facts.axis(n) + sizes[n] for n in names])
 
-    hidden = [axis_label(n, facts.unit(n)) for n in entry["estimates"] if n not in entry["measured"]]
+    hidden = [facts.axis(n) for n in entry["estimates"] if n not in entry["measured"]]
     delay = f"a measurement delay of {late} samples is assumed" if late else "no measurement delay is assumed"
     sensors = entry["sensor"].items()
     assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in sensor.items() if v) for n, sensor in sensors}
@@ -66,8 +71,8 @@ def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
         ("Reads", [f"Measured: {named(entry['measured'])}. Inputs: {named(entry['inputs'])}."]),
         ("Estimates", [f"{joined(hidden)}, for the next sample; {delay}."]),
         ("Rate", [f"One step every {dt:g} s ({1 / dt:g} Hz), {entry['states']} states."]),
-        ("Parameters", _parameters(entry["parameters"], facts.get("calibration") is not None)),
-        ("Sensor", [f"Assumed for {axis_label(n, facts.unit(n))}: {text}." for n, text in assumed.items() if text]),
+        ("Parameters", _parameters(entry["parameters"], bool(facts.get("calibration")))),
+        ("Sensor", [f"Assumed for {facts.axis(n)}: {text}." for n, text in assumed.items() if text]),
     ]
 
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ...design.task import split_name
-from ..content import Column, Section, Table, build
-from ..error_tables import ErrorCell, ErrorTable, tables_of
-from ..facts import Facts
+from ..content import Column, Row, Section, Table, build
+from ..facts import ErrorTable, Facts
 from ..names import condition_label, in_condition, joined, label_of, number, observer_label, published, words
 
-Rows = Sequence[tuple[ErrorTable, str]]
 _TEXT = (
     "RMS errors on held-out episodes: in percent of the largest value of the signal, mean over the units other than "
     "the nominal one, and the worst of them; and in the channel's unit of measure."
@@ -23,18 +21,13 @@ def errors(facts: Facts) -> Section | None:
     tables = facts.tables
     if not tables:
         return None
-    roles = _compared(facts)
-    notes = ["; ".join(filter(None, (joined(role), label_of(name).about))) for name, role in roles.items()]
-    about = [Column("observer", [observer_label(n) for n in roles], notes=notes)]
-    caption = f"Observers to compare{in_condition(tables[0].condition)}"
-    first = _table(caption, about, [(tables[0], name) for name in roles], facts)
-    every = [(table, name) for table in tables for name in table.cells]
-    about = [
-        Column("observer", [observer_label(name) for _, name in every], notes=[name for _, name in every]),
-        Column("condition", [condition_label(table.condition) for table, _ in every]),
-    ]
+    about = [Column("observer", note="note")]
+    notes = {n: "; ".join(filter(None, (joined(of), label_of(n).about))) for n, of in _compared(facts).items()}
+    rows = [_row(tables[0], name) | {"note": note} for name, note in notes.items()]
+    first = _table(f"Observers to compare{in_condition(tables[0].condition)}", about, tables[:1], rows, facts)
     caption = f"All {len(tables[0].cells)} observers in all conditions; small: 95 % interval of the mean over units"
-    whole = _table(caption, about, every, facts, folded=True, sortable=True)
+    rows = [_row(table, name) | {"note": name} for table in tables for name in table.cells]
+    whole = _table(caption, [*about, Column("condition")], tables, rows, facts, folded=True, sortable=True)
     more = [_TRUE] if any("true_rms" in r for r in facts.get("evaluation")) else []
     return Section("errors", "Errors", [" ".join([_TEXT, *more])], tables=[first, whole], figure="observers_in_time")
 
@@ -60,47 +53,55 @@ def left_out(facts: Facts) -> Section | None:
         "observers run on the units of the fold, as on new units. Certified: in how many folds."
     )
     failed = [f"Fold {int(n) + 1} failed: {reason}" for n, reason in folded["failed"].items()]
-    tables = []
-    for table in tables_of(folded["rows"], facts.study["identify_on"]):
-        entries = [folded["observers"].get(name, {}) for name in table.cells]
-        parts = {"made": ("designed", ""), "robust": ("set of plants", "certified")}
-        parts["relift_certified"] = ("at run time", "certified")
-        about = [Column("observer", [observer_label(name) for name in table.cells])]
-        for key, (title, group) in parts.items():
-            counts = [None if e.get(key) is None else f"{e[key]}/{folds}" for e in entries]
-            about.append(Column(title, counts, group))
+    parts = [("made", "designed", ""), ("robust", "set of plants", "certified")]
+    parts.append(("relift_certified", "at run time", "certified"))
+    about, tables = [Column("observer"), *(Column(title, key, group) for key, title, group in parts)], []
+    for table in facts.tables_of(folded["rows"]):
+        rows = []
+        for name in table.cells:
+            entry = folded["observers"].get(name, {})
+            counts = {key: f"{entry[key]}/{folds}" for key, _, _ in parts if entry.get(key) is not None}
+            rows.append(_row(table, name) | counts)
         caption = f"Units left out{in_condition(table.condition)}"
-        tables.append(_table(caption, about, [(table, name) for name in table.cells], facts, sortable=True))
+        tables.append(_table(caption, about, [table], rows, facts, sortable=True))
     return Section("left-out", "Units left out", [text, *failed], tables=tables)
 
 
-def _table(caption: str, about: Sequence[Column], rows: Rows, facts: Facts, **options: bool) -> Table | None:
+def _row(table: ErrorTable, name: str) -> Row:
+    """Return the errors of an observer in one condition, by channel and what they are."""
+    row: Row = {"observer": observer_label(name), "condition": condition_label(table.condition)}
+    for channel, cell in table.cells[name].items():
+        interval, lag_s = "–".join(number(v, 2) for v in cell.interval), cell.means.get("true_lag_s")
+        known = {"mean": cell.shown, "worst": cell.worst, "interval": interval}
+        known |= {**cell.means, "lag": lag_s and 1e3 * lag_s}
+        row |= {(channel, key): value for key, value in known.items()}
+    return row
+
+
+def _table(
+    caption: str,
+    about: Sequence[Column],
+    tables: Sequence[ErrorTable],
+    rows: Sequence[Row],
+    facts: Facts,
+    **options: bool,
+) -> Table | None:
     """Return errors of all hidden channels, a row an observer and condition."""
-    channels = dict.fromkeys(c for table, _ in rows for c in table.hidden(facts.measured))
-    columns = [column for c in channels for column in _channel(c, facts.unit(c), rows, bool(options))]
-    return build(caption, [*about, *columns], facts.label, **options)
-
-
-def _channel(channel: str, unit: str, rows: Rows, details: bool) -> list[Column]:
-    """Return the columns of one channel; `details` are intervals."""
-    cells = [table.cells[name].get(channel, ErrorCell()) for table, name in rows]
-    group = words(channel)
-    intervals = ["–".join(number(v, 2) for v in c.interval) if c.interval and details else "" for c in cells]
-    means = ["diverged" if c.diverged else c.mean for c in cells]
-    lags = [c.means.get("true_lag_s") for c in cells]
-    return [
-        Column("mean (%)", means, group, best=True, notes=intervals),
-        Column("worst (%)", [c.worst for c in cells], group, best=True),
-        Column(f"RMS ({unit})" if unit else "RMS", [c.means.get("rms") for c in cells], group),
-        Column("against the true signal (%)", [c.means.get("true_error_percent") for c in cells], group),
-        Column("lag (ms)", [None if lag is None else 1e3 * lag for lag in lags], group),
-    ]
+    columns = list(about)
+    for channel in dict.fromkeys(c for table in tables for c in table.hidden()):
+        unit = facts.unit(channel)
+        titles = {"mean": "mean (%)", "worst": "worst (%)", "rms": f"RMS ({unit})" if unit else "RMS"}
+        titles |= {"true_error_percent": "against the true signal (%)", "lag": "lag (ms)"}
+        for key, title in titles.items():
+            note = (channel, "interval") if key == "mean" and options else ""
+            columns.append(Column(title, (channel, key), words(channel), best=key in ("mean", "worst"), note=note))
+    return build(caption, columns, rows, facts.label, **options)
 
 
 def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
     """Return the few observers that answer most questions, each with the roles it is compared in."""
     table, entries = facts.tables[0], facts.observers
-    channels = table.hidden(facts.measured)
+    channels = table.hidden()
     designed = [n for n in table.cells if not label_of(n).baseline]
     certified = [n for n in designed if entries.get(n, {}).get("worst_case_h2") is not None]
     certified = certified or [n for n in designed if entries.get(n, {}).get("set_certified")]

@@ -8,7 +8,7 @@ from importlib import import_module
 
 from ...core.linalg import radius_text
 from ...data import some
-from ..content import Column, Section, build
+from ..content import Column, Row, Section, build
 from ..facts import Facts
 from ..names import in_condition, minus, model_label, number, words
 
@@ -24,20 +24,22 @@ def recordings(facts: Facts) -> Section:
     ]
     text = f"{study['units']} units, sampled every {study['sample_period_s']:g} s."
     text += f" Episodes: {'; '.join(counts)}." if counts else ""
-    aside = [row["unit"] for row in facts.get("units", []) if row.get("group") == "outliers"]
-    text += f" Set aside as outliers: {some(aside)}." if aside else ""
+    text += f" Set aside as outliers: {some(facts.set_aside)}." if facts.set_aside else ""
     text += f" Dropped for bad samples: {some(study['dropped'])}." if study.get("dropped") else ""
     channels, sensor = study.get("channels", {}), study.get("sensor", {})
     roles = dict.fromkeys(study.get("inputs", ()), "input") | dict.fromkeys(facts.measured, "measured")
-    declared = [", ".join(f"{words(k)} {v:g}" for k, v in sensor.get(c, {}).items() if v) for c in channels]
-    columns = [
-        Column("channel", [words(c) for c in channels]),
-        Column("unit", [u or "–" for u in channels.values()]),
-        Column("role", [roles.get(c, "estimated") for c in channels]),
-        Column("resolution", [study.get("resolution", {}).get(c) for c in channels]),
-        Column("declared sensor", declared),
+    rows = [
+        {
+            "channel": words(c),
+            "unit": unit or "–",
+            "role": roles.get(c, "estimated"),
+            "resolution": study.get("resolution", {}).get(c),
+            "declared sensor": ", ".join(f"{words(k)} {v:g}" for k, v in sensor.get(c, {}).items() if v),
+        }
+        for c, unit in channels.items()
     ]
-    return Section("recordings", "Recordings", [text], tables=[build("Channels", columns)], figure="signals")
+    table = build("Channels", [Column(key) for key in rows[0]], rows) if rows else None
+    return Section("recordings", "Recordings", [text], tables=[table], figure="signals")
 
 
 def calibration(facts: Facts) -> Section | None:
@@ -50,7 +52,7 @@ def calibration(facts: Facts) -> Section | None:
         "the phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse "
         f"apart. Mean lag of the loop: {minus(format(math.degrees(entry['lag_rad']), '.1f'))}°."
     )
-    missing = [row["unit"] for row in facts.get("units", []) if row["status"] == "not calibrated"]
+    missing = [row["unit"] for row in facts.get("units") if row["status"] == "not calibrated"]
     more = [f"Not calibrated, and without models: {some(missing)}."] if missing else []
     return Section("calibration", "Phase calibration", [text, *more], figure="phase")
 
@@ -66,18 +68,18 @@ def models(facts: Facts) -> Section | None:
     if any(not name.endswith("_edmd") for name in entries):
         text += " Refined models minimise the simulation error, regularised towards the population mean; the strength "
         text += "is chosen on the last training episode of every unit."
-    errors = {name: entry.get("freerun_error_percent", {}) for name, entry in entries.items()}
-    columns = [
-        Column("model", [model_label(name) for name in entries]),
-        Column("states", [entry["order"] for entry in entries.values()]),
-        Column("largest pole", [minus(radius_text(entry["spectral_radius_max"])) for entry in entries.values()]),
-    ]
-    for channel in dict.fromkeys(c for entry in errors.values() for c in entry):
-        for what in ("median", "worst"):
-            values = [entry.get(channel, {}).get(what) for entry in errors.values()]
-            columns.append(Column(f"{what} (%)", values, words(channel), best=True))
+    rows, columns = list[Row](), {(title, ""): Column(title) for title in ("model", "states", "largest pole")}
+    for name, entry in entries.items():
+        pole = minus(radius_text(entry["spectral_radius_max"]))
+        row: Row = {"model": model_label(name), "states": entry["order"], "largest pole": pole}
+        for channel, errors in entry.get("freerun_error_percent", {}).items():
+            for what, error in errors.items():
+                row[channel, what] = error
+                columns[channel, what] = Column(f"{what} (%)", (channel, what), words(channel), best=True)
+        rows.append(row)
     caption = "Simulation of held-out episodes from their first state, error in percent of the largest value"
-    return Section("models", "Models", [text], tables=[build(caption, columns)], figure="free_run")
+    table = build(caption, list(columns.values()), rows)
+    return Section("models", "Models", [text], tables=[table], figure="free_run")
 
 
 def spread(facts: Facts) -> Section | None:
@@ -91,11 +93,13 @@ def spread(facts: Facts) -> Section | None:
         f"six forms; its peak is the largest singular value over units and frequencies. The design uses the form "
         f"“{words(first['form'])}”. Below 0 dB a unit differs by less than the whole signal."
     )
-    forms = list(dict.fromkeys(f for entry in entries.values() for f in entry["peak_db"]))
-    used = ["used" if form == first["form"] else "" for form in forms]
-    columns = [Column("form", [words(form) for form in forms], notes=used)]
-    columns += [Column(f"{model_label(n)} (dB)", [e["peak_db"].get(f) for f in forms]) for n, e in entries.items()]
-    table = build("Peak residual, with the nominal unit that suits each form best", columns, words(first["form"]))
+    rows = list[Row]()
+    for form in dict.fromkeys(form for entry in entries.values() for form in entry["peak_db"]):
+        peaks = {name: entry["peak_db"].get(form) for name, entry in entries.items()}
+        rows.append({"form": words(form), "used": "used" if form == first["form"] else "", **peaks})
+    columns = [Column("form", note="used"), *(Column(f"{model_label(name)} (dB)", name) for name in entries)]
+    caption = "Peak residual, with the nominal unit that suits each form best"
+    table = build(caption, columns, rows, words(first["form"]))
     return Section("spread", "Spread of the units", [text], tables=[table], figure="models")
 
 
@@ -108,26 +112,30 @@ def uncertainty(facts: Facts) -> Section | None:
         "Each residual is W_left · Δ · W_right with ‖Δ‖ ≤ 1. The weights bound every unit where no normalised residual "
         "exceeds one. The approximation error is what the form cannot represent; it is covered by an additive term."
     )
-    weights = [entry["weight"] for entry in entries.values()]
-    noise = [entry.get("noise_share") for entry in entries.values()]
-    orders = [" and ".join(", ".join(map(str, side)) for side in entry["orders"]) for entry in weights]
-    columns = [
-        Column("model", [model_label(name) for name in entries]),
-        Column("orders, left and right", orders),
-        Column("largest normalised residual", [number(w["cover_max"], 6) for w in weights]),
-        Column("bounds every unit", [None if w["cover_max"] is None else w["cover_max"] <= 1 for w in weights]),
-        Column("above the optimal bound (dB)", [entry["overbound_db_max"] for entry in weights]),
-        Column("estimation noise in the spread (%)", [None if n is None else 100 * n["at_peak"] for n in noise]),
-        Column("approximation error", [entry["misfit_max"] for entry in entries.values()]),
-    ]
-    return Section("uncertainty", "Uncertainty weights", [text], tables=[build("Weights", columns)], figure="weights")
+    rows = list[Row]()
+    for name, entry in entries.items():
+        weight, noise = entry["weight"], entry.get("noise_share")
+        largest = weight["cover_max"]
+        row = {
+            "model": model_label(name),
+            "orders, left and right": " and ".join(", ".join(map(str, side)) for side in weight["orders"]),
+            "largest normalised residual": number(largest, 6),
+            "bounds every unit": None if largest is None else largest <= 1,
+            "above the optimal bound (dB)": weight["overbound_db_max"],
+            "estimation noise in the spread (%)": noise and 100 * noise["at_peak"],
+            "approximation error": entry["misfit_max"],
+        }
+        rows.append(row)
+    table = build("Weights", [Column(title) for title in rows[0]], rows)
+    return Section("uncertainty", "Uncertainty weights", [text], tables=[table], figure="weights")
 
 
 def run(facts: Facts) -> Section:
     """Return times, versions, and where the settings are."""
-    timing = facts.get("timing_s", {})
-    times = [Column("stage", list(timing)), Column("seconds", [float(v) for v in timing.values()])]
+    timing = facts.get("timing_s")
+    times = [{"stage": stage, "seconds": float(seconds)} for stage, seconds in timing.items()]
+    table = build("Time; a stage that was up to date counts in full", [Column("stage"), Column("seconds")], times)
     versions = [f"{name} {import_module(name).__version__}" for name in _PACKAGES]
     text = "metrics.json holds all numbers of this page, study.json all settings. Software: "
     text += f"{', '.join(versions)} and Python {platform.python_version()}."
-    return Section("run", "Run", [text], tables=[build("Time; a stage that was up to date counts in full", times)])
+    return Section("run", "Run", [text], tables=[table])

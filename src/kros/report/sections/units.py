@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from operator import itemgetter
 
 from ...core import ByName
-from ..content import Column, Section, build
-from ..facts import Facts
+from ..content import Column, Row, Section, build
+from ..facts import Facts, grouped
 from ..names import in_condition, number, words
 from ..theme import DRAWING
 
@@ -23,50 +24,38 @@ def units(facts: Facts) -> Section | None:
     """Return the table of units, flagged ones first; None where no unit is known."""
     if not facts.get("units"):
         return None
-    rows, home = facts.get("outliers", []), facts.study["identify_on"]
-    errors = {
-        (r["unit"], r["channel"]): r
-        for r in facts.get("evaluation", [])
+    scores, home = facts.get("outliers"), facts.study["identify_on"]
+    errors = [
+        r
+        for r in facts.get("evaluation")
         if r["observer"] == facts.deployed and r["condition"] == home and r["channel"] not in facts.measured
-    }
-    scores = {(r["unit"], r["condition"]): r for r in rows}
-    shown = _first(facts.get("units"), errors, {r["unit"] for r in rows if r["outlier"]})
-    names = [row["unit"] for row in shown]
-    phases = [row.get("phase_rad") for row in shown]
-    columns = [
-        Column("unit", names),
-        Column("status", [_status(row, [r for r in rows if r["unit"] == row["unit"]]) for row in shown]),
-        *_columns(names, errors, _ERRORS, words),
-        *_columns(names, scores, _OF_SCORES, lambda condition: f"outlier test{in_condition(condition)}"),
-        Column("phase (°)", [None if p is None else math.degrees(p) for p in phases]),
     ]
+    columns = [Column("unit"), Column("status")]
+    for channel in dict.fromkeys(r["channel"] for r in errors):
+        columns += [Column(title, (channel, key), words(channel)) for title, key in _ERRORS.items()]
+    for condition in dict.fromkeys(r["condition"] for r in scores):
+        group = f"outlier test{in_condition(condition)}"
+        columns += [Column(title, (condition, key), group) for title, key in _OF_SCORES.items()]
+    errors_of, scores_of = (grouped(known, itemgetter("unit")) for known in (errors, scores))
+    rows = [_row(r, errors_of.get(r["unit"], ()), scores_of.get(r["unit"], ())) for r in facts.get("units")]
+    rows.sort(key=lambda row: (row["status"] != "flagged", -row["largest"], row["unit"]))
+    shown = rows[: DRAWING.units]
     order = f"units{in_condition(home)}, flagged ones and largest errors first"
-    count = f"{len(shown)} of {len(facts.get('units'))} {order}"
-    table = build(f"{count}; errors in percent of the largest value", columns, sortable=True)
+    caption = f"{len(shown)} of {len(rows)} {order}; errors in percent of the largest value"
+    table = build(caption, [*columns, Column("phase (°)", "phase")], shown, sortable=True)
     text = [f"Errors are those of “{facts.label}”."] if facts.deployed else []
-    text += [_SCORES, *(_flagged(r) for r in rows[: DRAWING.units] if r["outlier"])] if rows else []
-    return Section("units", "Units", [" ".join(text)], tables=[table], figure="outlier_scores" if rows else "")
+    text += [_SCORES, *(_flagged(r) for r in scores[: DRAWING.units] if r["outlier"])] if scores else []
+    return Section("units", "Units", [" ".join(text)], tables=[table], figure="outlier_scores" if scores else "")
 
 
-def _first(rows: Sequence[ByName], errors: Mapping[tuple[str, str], ByName], flagged: set[str]) -> list[ByName]:
-    """Return flagged units, then those with the largest errors; of very many units the first ones."""
-    largest = dict[str, float]()
-    for (unit, _), row in errors.items():
-        error = math.inf if row["error_percent"] is None else row["error_percent"]
-        largest[unit] = max(largest.get(unit, 0.0), error)
-    ordered = sorted(rows, key=lambda r: (r["unit"] not in flagged, -largest.get(r["unit"], 0.0), r["unit"]))
-    return ordered[: DRAWING.units]
-
-
-def _columns(
-    names: Sequence[str], rows: Mapping[tuple[str, str], ByName], keys: Mapping[str, str], group: Callable[[str], str]
-) -> list[Column]:
-    """Return columns of what rows by unit, and by channel or condition, hold."""
-    return [
-        Column(title, [rows.get((unit, place), {}).get(key) for unit in names], group(place))
-        for place in dict.fromkeys(place for _, place in rows)
-        for title, key in keys.items()
-    ]
+def _row(row: ByName, errors: Sequence[ByName], scores: Sequence[ByName]) -> Row:
+    """Return what is known of a unit: errors by channel, scores by condition."""
+    known = {(r["channel"], key): r.get(key) for r in errors for key in _ERRORS.values()}
+    known |= {(r["condition"], key): r.get(key) for r in scores for key in _OF_SCORES.values()}
+    percent = [math.inf if r["error_percent"] is None else r["error_percent"] for r in errors]
+    phase = row.get("phase_rad")
+    about = {"unit": row["unit"], "status": _status(row, scores), "largest": max(percent, default=0.0)}
+    return about | {"phase": None if phase is None else math.degrees(phase)} | known
 
 
 def _status(row: ByName, scores: Sequence[ByName]) -> str:

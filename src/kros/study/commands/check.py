@@ -9,33 +9,23 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core import Array, ConfigError, DataError, Executor, Flags, Record, plain
+from ...core import Array, ConfigError, DataError, Executor, Flags, plain
 from ...data import Population
 from ...data.recording import check_population
 from ...identify import ModelSet
-from ...identify.calibration import training_keys, unit_parameters
+from ...identify.calibration import Values, training_keys, unit_parameters
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
-from ...observer import Observer, run_innovations, screened
+from ...observer import run_innovations, screened
 from ...report.unit_verdicts import Rows, with_verdict
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import Evidence, Recorded, score_row
 from ...uncertainty.outliers.score import FEWEST_UNITS, Status
-from ..config import Stage, StudyConfig
+from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
-from ..engine.store import Store, open_finished
-from .field import (
-    DEPLOYED,
-    FieldRecordings,
-    check_channels,
-    hidden_states,
-    identify_on,
-    load_calibration,
-    open_data,
-    status_counts,
-)
+from ..engine.store import DEPLOYED
+from .field import STAGES, FieldRecordings, check_channels, hidden_states, open_data, status_counts
 
-STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)
 Judged = list[tuple[Array, Flags]]  # innovations, and which samples are judged
 
 
@@ -44,28 +34,29 @@ def check_units(run: Path, data: Path, workers: int, same_unit: bool) -> Rows:
 
     A name of a unit of the study is refused for other recordings, unless `same_unit` says it is the same machine.
     """
-    with open_finished(run, *STAGES) as (config, store):
-        return verdicts(config, store, data, workers, same_unit)
+    with open_finished(run, *STAGES) as context:
+        return verdicts(context, data, workers, same_unit)
 
 
-def verdicts(config: StudyConfig, store: Store, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:
+def verdicts(context: Context, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:
     """Do the same in a run that is open."""
-    rows = scored(config, store, data, workers, same_unit)
+    rows = scored(context, data, workers, same_unit)
     return [plain(with_verdict(row)) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
 
 
-def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool) -> Rows:
+def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     """Score the units of some recordings."""
-    pattern = re.compile("outliers/([^/]+)/outlier_model.json")
-    names = [m[1] for name in sorted(store.files()) if (m := pattern.fullmatch(name))]
-    observer = Observer.load(store.path(*DEPLOYED)) if store.holds(*DEPLOYED) else None
-    population = open_data(config, data, hidden_states(observer) if observer else ())
+    store = context.store
+    matches = (re.fullmatch("outliers/([^/]+)/outlier_model.json", name) for name in sorted(store.files()))
+    names = [match[1] for match in matches if match]
+    observer = context.deployed if store.holds(*DEPLOYED) else None
+    population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
-    watched: Rows = []
+    watched = Rows()
     if observer is not None:
         hidden = any(name not in population.states for name in observer.recorded)
         if hidden or observer.monitor is not None:
-            watched = monitored(FieldRecordings.open(config, store, data))
+            watched = monitored(FieldRecordings.open(context, data))
         if hidden:
             return watched
         check_channels(population, observer)
@@ -83,26 +74,31 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_uni
             "name the condition, as in the study."
         )
     levels = {(r["unit"], r["condition"]): {k: r[k] for k in r if k.startswith("level_")} for r in watched}
-    rows: Rows = []
+    rows = Rows()
     with open_executor(workers) as executor:
         for name, models in known.items():
             outliers = OutlierModel.load(store.path("outliers", name))
-            rows += score_condition(store, population, models, outliers, executor, same_unit)
+            rows += score_condition(context, population, models, outliers, executor, same_unit)
     return [row | levels.get((row["unit"], row["condition"]), {}) for row in rows]
 
 
 def score_condition(
-    store: Store, population: Population, models: ModelSet, outliers: OutlierModel, executor: Executor, same_unit: bool
+    context: Context,
+    population: Population,
+    models: ModelSet,
+    outliers: OutlierModel,
+    executor: Executor,
+    same_unit: bool,
 ) -> Rows:
     """Score all units that were recorded in one condition."""
     condition, training = models.condition, training_keys(population)
     everything = {unit: keys for unit, c, keys in population.groups() if c == condition}
     units = [u for u in population.unit_ids if training.get((u, condition))]
-    parameters: dict[str, dict[str, float]] = {u: {} for u in units}
+    parameters: Values = {u: {} for u in units}
     if models.lifting.parameters:
-        parameters = unit_parameters(population.select(units), load_calibration(store), identify_on(store))
+        parameters = unit_parameters(population.select(units), context.calibration, context.facts.identify_on)
     tasks = [(population.select([u], [condition]), everything[u], models.lifting) for u in units]
-    factors = EpisodeFactors.load(store.path("factors", quote(condition, safe="")))
+    factors = EpisodeFactors.load(context.store.path("factors", quote(condition, safe="")))
     recorded, rows = Recorded.of(factors, models, outliers.freqs_hz), Rows()
     halves = recorded.halves()
     motion = None if halves is None else outliers.motion_levels(*halves)
@@ -135,17 +131,27 @@ def monitored(recordings: FieldRecordings) -> Rows:
             samples += len(arrived.y)
             counts.update(status_counts(screened(observer, arrived.y, arrived.u).status))
             if monitor is not None:
-                values = arrived.parameters(observer)
-                nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
+                nu, good = run_innovations(observer, arrived.y, arrived.u, arrived.parameters, monitor.settle)
                 judged.append((nu[:, 0], good[:, 0]))
         level = None
         if monitor is not None and any(good.any() for _, good in judged):
             level = float(monitor.level(np.concatenate(monitor.in_turn(judged))).max())
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
-        row: Record = dict.fromkeys(("score", "threshold", "detectable"))
-        row |= {"unit": unit, "condition": condition, "outlier": outlier, "episodes": len(keys), "left_out": []}
-        row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "missing": missing, "level_db": level}
-        row |= {"level_rate": monitor and monitor.false_alarm_rate, "level_units": monitor and monitor.units}
-        row |= {"recorded_s": samples * population.sample_period_s, "samples": counts}
-        rows.append(row | {"parameters": recordings.sources.get(unit)})
+        row = {
+            **dict.fromkeys(("score", "threshold", "detectable")),
+            "unit": unit,
+            "condition": condition,
+            "outlier": outlier,
+            "episodes": len(keys),
+            "left_out": [],
+            "status": Status.OUTLIER if outlier else Status.CANNOT_TELL,
+            "missing": missing,
+            "level_db": level,
+            "level_rate": monitor and monitor.false_alarm_rate,
+            "level_units": monitor and monitor.units,
+            "recorded_s": samples * population.sample_period_s,
+            "samples": counts,
+            "parameters": recordings.sources.get(unit),
+        }
+        rows.append(row)
     return rows

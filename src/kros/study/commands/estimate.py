@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 
-from ...core import ConfigError, Record, load_artifact, write_bytes
+from ...core import ConfigError, Record, write_bytes
 from ...export.estimates import ENDINGS, writer
 from ...observer import recorded_channel, recorded_factors
 from ..config import Stage
-from ..engine.store import open_finished
+from ..engine.context import open_finished
 from .field import FieldRecordings, status_counts
 
 
@@ -23,15 +23,15 @@ def estimate_recordings(
 
     The band is the bound of the RMS error for recorded signals, where the observer has one and the sample is good.
     """
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
         if out.exists() or out.suffix not in ENDINGS:
             raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
         if plot is not None and plot.suffix != ".png":
             raise ConfigError(f"--plot {plot}: should end in .png.")
-        recordings = FieldRecordings.open(config, store, data, given, track)
+        recordings = FieldRecordings.open(context, data, given, track)
         observer, population = recordings.observer, recordings.population
         names = observer.recorded
-        stated = load_artifact(store.path("observers"), "observers")[0]["facts"].get(observer.name, {})
+        stated = context.observers_record["facts"].get(observer.name, {})
         bound = np.array([stated.get("set_bound", {}).get(name) for name in names], dtype=float)
         factors = recorded_factors(observer, [*(c.name for c in population.channels), *names])
         counts, n, first = defaultdict[str, Counter[str]](Counter), len(names), None
@@ -49,15 +49,10 @@ def estimate_recordings(
         units = {name: recorded_channel(observer, name).unit for name in names}
         write_bytes(plot, estimates_png(population.sample_period_s, drawn, units))
     count = len(population.episodes)
-    return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
-
-
-def unit_lines(sources: Mapping[str, str], counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Return a line a unit with the source of its parameters and its samples by status, where there is any."""
-    lines = []
-    for unit in dict.fromkeys([*sources, *(u for u, of_unit in counts.items() if of_unit)]):
-        parts = [f"parameters {sources[unit]}"] if unit in sources else []
-        parts += [f"{count} samples {bit}" for bit, count in counts.get(unit, {}).items()]
+    lines = [f"estimates of {count} episode{'s' * (count != 1)} in {out}"]
+    for unit in dict.fromkeys([*recordings.sources, *(unit for unit, of_unit in counts.items() if of_unit)]):
+        parts = [f"parameters {recordings.sources[unit]}"] if unit in recordings.sources else []
+        parts += [f"{count} samples {bit}" for bit, count in counts[unit].items()]
         lines.append(f"  unit {unit}: {'; '.join(parts)}")
     return lines
 

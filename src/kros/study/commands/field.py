@@ -5,9 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import field, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -22,27 +21,25 @@ from ...core import (
     Names,
     did_you_mean,
     frozen,
-    load_artifact,
     read_toml,
 )
 from ...data import EpisodeKey, Population, read
 from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
-from ...identify import PhaseCalibration
 from ...identify.calibration import Texts, Values, unit_values
-from ...identify.survey import RecordingFacts
 from ...observer import Observer, SampleStatus
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
-from ..config import StudyConfig, validate_config
-from ..engine.store import Store
+from ..config import Stage, StudyConfig, validate_config
+from ..engine.context import Context
+from ..engine.store import DEPLOYED
 from ..stages.learning import ARRAYS
 from ..stages.load import LOAD
 
 log = logging.getLogger(__name__)
 # Episode, first sample, estimates and the tracked parameter, bits, what was recorded: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits, Array]
-DEPLOYED = ("observers", "deployed.json")
+STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)  # behind observers and scores
 _BLOCK = 20_000  # samples of an episode that are run at once
 _PHASES = 24  # values that are tried, around the circle
 _BATCH = 20  # shorter episodes that run side by side
@@ -100,33 +97,22 @@ def check_channels(population: Population, observer: Observer, *, hidden: bool =
         )
 
 
-def identify_on(store: Store) -> str:
-    """Return the condition that feeds synthesis in a run."""
-    return RecordingFacts.load(store.path("population")).identify_on
-
-
-def load_observer(store: Store, name: str = "deployed") -> Observer:
+def load_observer(context: Context, name: str = "deployed") -> Observer:
     """Load an observer of a run by its name; that of a load has the channels of the one that is deployed."""
+    store = context.store
     if not store.holds(*DEPLOYED):
         raise ConfigError(f"Run {store.folder}: has no deployed observer; run the study at least until synthesize.")
-    names = load_artifact(store.path("observers"), "observers")[0]["names"]
-    known = {"deployed": DEPLOYED} | {one: ("observers", f"{one}.json") for one in names}
+    known = {"deployed": DEPLOYED} | {n: ("observers", f"{n}.json") for n in context.observers_record["names"]}
     known |= {f"{k}/{LOAD}": (LOAD, f"{k}.json") for k in ("koopman", "linear") if store.holds(LOAD, f"{k}.json")}
     if name not in known:
         raise ConfigError(
             f"Run {store.folder}: has no observer {name!r}{did_you_mean(name, known) or ';'} known are "
             f"{', '.join(known)}."
         )
-    chosen = Observer.load(store.path(*known[name]))
+    chosen, about = Observer.load(store.path(*known[name])), context.deployed.about
     if chosen.about:
         return chosen
-    about = Observer.load(store.path(*DEPLOYED)).about
     return replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
-
-
-def load_calibration(store: Store) -> PhaseCalibration | None:
-    """Return the run's calibration, where it has one."""
-    return PhaseCalibration.load(store.path("calibration")) if store.holds("calibration", "calibration.json") else None
 
 
 def parse_given(texts: Collection[str], units: Collection[str], known: Collection[str]) -> Values:
@@ -154,28 +140,30 @@ class FieldRecordings:
     observer: Observer
     population: Population
     values: Values
-    sources: Mapping[str, str] = field(default_factory=dict)
+    sources: dict[str, str] = field(default_factory=dict)
     name: str | None = None  # of the parameter that a phase-locked loop follows
 
     @classmethod
     def open(
-        cls, config: StudyConfig, store: Store, data: Path, given: Collection[str] = (), track: str | None = None
+        cls, context: Context, data: Path, given: Collection[str] = (), track: str | None = None
     ) -> FieldRecordings:
         """Open what `data` names, and settle the parameters of every unit."""
-        observer = load_observer(store)
+        observer = load_observer(context)
         known = observer.lifting.parameters
         if track is not None and track not in known:
             raise ConfigError(f"--track {track}: the observer's parameters are {', '.join(known) or 'none'}.")
-        population = with_gaps(open_data(config, data, hidden_states(observer)))
+        population = with_gaps(open_data(context.config, data, hidden_states(observer)))
         check_channels(population, observer, hidden=False)
         chosen = parse_given(given, population.unit_ids, known)
-        values, sources, reasons = unit_values(population, load_calibration(store), identify_on(store), chosen)
-        return cls(observer, population, values, sources, track)._settled(reasons)
+        home = context.facts.identify_on
+        values, sources, reasons = unit_values(population, context.calibration, home, chosen)
+        recordings = cls(observer, population, values, sources, track)
+        recordings._settle(reasons)
+        return recordings
 
-    def _settled(self, reasons: Texts) -> FieldRecordings:
-        """Return the same with all parameters that the observer needs; one that is followed begins anywhere."""
-        values, sources = {unit: dict(known) for unit, known in self.values.items()}, dict(self.sources)
-        for unit, known in values.items():
+    def _settle(self, reasons: Texts) -> None:
+        """Refuse units without a parameter that the observer needs; one that is followed begins anywhere."""
+        for unit, known in self.values.items():
             missing = [name for name in self.observer.lifting.parameters if name not in known]
             if set(missing) - {self.name}:
                 reason, first = reasons.get(unit, "it was not calibrated."), missing[0]
@@ -185,9 +173,8 @@ class FieldRecordings:
                 )
             if self.name is not None:
                 known[self.name] = self._start(unit, self.name) if missing else known[self.name]
-                start = "of the smallest innovation" if missing else f"that is {sources.get(unit)}"
-                sources[unit] = f"tracked from the value {start}"
-        return replace(self, values=values, sources=sources)
+                start = "of the smallest innovation" if missing else f"that is {self.sources.get(unit)}"
+                self.sources[unit] = f"tracked from the value {start}"
 
     def _start(self, unit: str, name: str) -> float:
         """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
@@ -197,17 +184,13 @@ class FieldRecordings:
                 chosen[key] = next(self.population.blocks(key, _BLOCK))
         arrived = arriving(self.observer, self.population, chosen, {unit: values})
         step, known = 2 * np.pi / _PHASES, {**self.observer.parameters, **values}
-        signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
+        signals = (self.observer, arrived.y, arrived.u, arrived.lengths, known, name)
         coarse = least_innovation(*signals, np.arange(_PHASES) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
-    @cached_property
-    def _parameters(self) -> Values:
-        return {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
-
     def arriving(self, key: EpisodeKey) -> Arriving:
         """Read one episode as it arrives at the observer."""
-        return arriving(self.observer, self.population, {key: self.population.read(key)}, self._parameters)
+        return arriving(self.observer, self.population, {key: self.population.read(key)}, self.values)
 
     def estimates(self) -> Iterator[Estimated]:
         """Run the observer over all episodes, block by block."""
@@ -222,8 +205,8 @@ class FieldRecordings:
         before = np.empty((0, len(self.population.channels)))
         for block in self.population.blocks(key, _BLOCK):
             values, lead = np.concatenate([before, block]), len(before)
-            arrived = arriving(observer, self.population, {key: values}, self._parameters)
-            course = course or Course(observer, 1, arrived.parameters(observer), loop)
+            arrived = arriving(observer, self.population, {key: values}, self.values)
+            course = course or Course(observer, 1, arrived.parameters, loop)
             run = course.take(arrived.y[lead:], arrived.u[lead:])
             columns = run.estimates[:, 0, :n]
             if loop is not None:

@@ -6,16 +6,12 @@ from pathlib import Path
 
 from ...core import read_json
 from ...evaluate.closed_loop import Controller, LoopResult, close_loop
-from ...uncertainty import UncertainModels
-from ..config import Stage
-from ..engine.store import open_finished
-from .field import load_observer
-
-STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)
+from ..engine.context import open_finished
+from .field import STAGES, load_observer
 
 
 def judge_controller(run: Path, file: Path, observer: str = "deployed") -> LoopResult:
     """Judge the loop of a controller, a state space as JSON, over the estimates of an observer of a run."""
     controller = Controller.of(read_json(file), f"Controller {file}")
-    with open_finished(run, *STAGES) as (_, store):
-        return close_loop(load_observer(store, observer), UncertainModels.load(run), controller)
+    with open_finished(run, *STAGES) as context:
+        return close_loop(load_observer(context, observer), context.uncertain, controller)

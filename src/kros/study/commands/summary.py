@@ -8,15 +8,15 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
-from ...core import ConfigError, Record, load_artifact, write_bytes
+from ...core import ConfigError, Record, write_bytes
 from ...loops.compiler import COMPILERS
 from ...report.compare import comparison, lines, sections
-from ...report.content import Column, Section, build
-from ...report.error_tables import ErrorCell
+from ...report.content import Column, Row, Section, build
 from ...report.facts import Facts
 from ...report.html import filled
 from ..config import Stage
-from ..engine.store import METRICS, open_finished
+from ..engine.context import open_finished
+from ..engine.store import METRICS
 from ..pipeline import RunResult
 
 _REQUIRED = ("numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "jinja2", "matplotlib")
@@ -48,31 +48,26 @@ def _version(name: str, otherwise: str) -> str:
 
 def ranking(facts: Facts) -> list[str]:
     """Return one line an observer, the smallest error of the hidden channels first."""
-    table = facts.table
-    if table is None:
-        return []
-    hidden = table.hidden(facts.measured)
-    names = sorted(table.cells, key=lambda name: table.mean(name, hidden))
-    columns = [Column("", [f"{name}{'  <- deployed' if name == facts.deployed else ''}" for name in names])]
-    for channel in hidden:
-        cells = [table.cells[name].get(channel, ErrorCell()) for name in names]
-        columns.append(Column(channel, ["diverged" if cell.diverged else cell.mean for cell in cells]))
+    table, hidden, rows = facts.table, facts.table.hidden(), list[Row]()
+    for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
+        means = {channel: cell.shown for channel, cell in table.cells[name].items()}
+        rows.append({"": f"{name}{'  <- deployed' if name == facts.deployed else ''}", **means})
     title = "observers by mean error on held-out episodes, percent of the largest value:"
-    return lines(Section("", title, tables=[build("", columns)]))[1:]
+    shown = build("", [Column(name) for name in ("", *hidden)], rows)
+    return lines(Section("", title, tables=[shown]))[1:] if shown else []
 
 
 def list_run(run: Path) -> list[str]:
     """Return what was studied, which stages are done, the observers in the order of their errors, and the verdict."""
-    with open_finished(run) as (config, store):
-        manifest = store.manifest
+    with open_finished(run) as context:
+        config, store, manifest = context.config, context.store, context.store.manifest
         done = [f"{stage} {manifest[stage].seconds:.3g} s" for stage in Stage if stage in manifest]
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
         if store.path(METRICS).exists():
             result = RunResult(store.folder, store.metrics())
             return lines + ranking(Facts(result.metrics)) + result.summary().splitlines()[1:]
         if Stage.SYNTHESIZE in manifest:
-            names = load_artifact(store.path("observers"), "observers")[0]["names"]
-            lines += [f"observers: {', '.join(names)}"]
+            lines += [f"observers: {', '.join(context.observers_record['names'])}"]
         return [*lines, "the run has not ended; the same command of kros run goes on with it"]
 
 
@@ -83,10 +78,10 @@ def compare_runs(runs: Sequence[Path], out: Path | None) -> tuple[Record, list[s
     names = [run.name for run in runs] if len({run.name for run in runs}) == len(runs) else list(map(str, runs))
     read = {}
     for name, run in zip(names, runs, strict=True):
-        with open_finished(run) as (config, store):
-            if not store.path(METRICS).exists():
+        with open_finished(run) as context:
+            if not (run / METRICS).exists():
                 raise ConfigError(f"Run {run}: has not ended; the same command of kros run goes on with it.")
-            read[name] = config.dump(), Facts(store.metrics())
+            read[name] = context.config.dump(), Facts(context.store.metrics())
     compared = comparison(read)
     shown = sections(names, compared)
     if out is not None:

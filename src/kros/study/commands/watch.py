@@ -11,14 +11,15 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from ...core import ConfigError, KrosError, Record, digest_of, write_json
+from ...core import ConfigError, KrosError, digest_of, write_json
 from ...core.files import draft_beside, is_file, link_or_copy, stamp_of
 from ...data.readers.parquet import INDEX
 from ...report.unit_verdicts import worst
-from ..config import StudyConfig
+from ..engine.context import Context, open_finished
 from ..engine.lock import locked
-from ..engine.store import Store, load_run, open_finished
-from .check import STAGES, verdicts
+from ..engine.store import Store, load_run
+from .check import verdicts
+from .field import STAGES
 
 Waiting = dict[Path, Path]  # recordings, a file or a folder of Parquet, by where their results will be
 
@@ -36,9 +37,9 @@ def watch(folder: Path, run: Path, out: Path | None, every_s: float, once: bool)
         Store(out).tidy()
         while (now := waiting(folder, out)) or not once:
             if rest := {place: path for place, path in now.items() if place in before}:
-                with open_finished(run, *STAGES) as (config, store):
+                with open_finished(run, *STAGES) as context:
                     for place, path in rest.items():
-                        yield from judged(config, store, path, place, folder, out)
+                        yield from judged(context, path, place, folder, out)
             before = now
             time.sleep(every_s)
 
@@ -60,21 +61,22 @@ def place_of(path: Path, changing: Path, folder: Path, out: Path) -> Path:
     return out / f"{path.relative_to(folder.parent)}.{digest_of(stamp_of(changing))[:12]}.json"
 
 
-def judged(config: StudyConfig, store: Store, path: Path, place: Path, folder: Path, out: Path) -> Iterator[str]:
+def judged(context: Context, path: Path, place: Path, folder: Path, out: Path) -> Iterator[str]:
     """Check one recording, alone in a folder like its own, and write its result; yield its line, none if it changed."""
-    name, result = str(path.relative_to(folder)).encode(errors="backslashreplace").decode(), Record()
+    name, data, changing = path.relative_to(folder), path, path / f"{INDEX}.json"
     with draft_beside(out) as draft:
         try:
             if path.is_file():
-                target = draft / path.relative_to(folder)
-                target.parent.mkdir(parents=True)
-                link_or_copy(path, target)
-            rows = verdicts(config, store, draft if path.is_file() else path)
-            result = {"verdict": worst(rows), "reason": "; ".join(row["reason"] for row in rows), "rows": rows}
+                data, changing = draft, path
+                (draft / name).parent.mkdir(parents=True)
+                link_or_copy(path, draft / name)
+            rows = verdicts(context, data)
+            verdict, reason = str(worst(rows)), "; ".join(row["reason"] for row in rows)
         except (KrosError, OSError) as error:
-            reason = str(error).replace(str(draft), str(folder))
-            result = {"verdict": "refused", "reason": reason, "rows": []}
+            verdict, reason, rows = "refused", str(error).replace(str(draft), str(folder)), []
     with suppress(FileNotFoundError):
-        if place == place_of(path, path if path.is_file() else path / f"{INDEX}.json", folder, out):
-            write_json(place, {"schema": 1, "recording": name} | result)
-            yield f"{result['verdict']:<9}  {name}: {result['reason']}"
+        if place == place_of(path, changing, folder, out):
+            recording = str(name).encode(errors="backslashreplace").decode()
+            result = {"recording": recording, "verdict": verdict, "reason": reason, "rows": rows}
+            write_json(place, {"schema": 1, **result})
+            yield f"{verdict:<9}  {recording}: {reason}"

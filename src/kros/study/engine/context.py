@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 
 from ...core import Names, Record, digest_of, frozen, load_artifact, stamp_of, write_json
 from ...core.work import Results, Work
@@ -17,9 +19,11 @@ from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...identify.survey import RecordingFacts
 from ...lifting import Lifting
+from ...observer import Observer
 from ...uncertainty import UncertainModels
 from ..config import Stage, StudyConfig
-from .store import METRICS, STUDY, Store, code_key
+from .lock import locked
+from .store import DEPLOYED, METRICS, STUDY, Store, code_key, load_run
 
 
 @frozen
@@ -59,7 +63,8 @@ class Context:
     @cached_property
     def calibration(self) -> PhaseCalibration | None:
         """What the calibrate stage left, where the lifting has a phase."""
-        return None if self.phase_spec is None else PhaseCalibration.load(self.store.path("calibration"))
+        known = self.store.holds("calibration", "calibration.json")
+        return PhaseCalibration.load(self.store.path("calibration")) if known else None
 
     @cached_property
     def identified(self) -> IdentifiedModels:
@@ -77,9 +82,24 @@ class Context:
         return load_artifact(self.store.path("observers"), "observers")[0]
 
     @cached_property
+    def deployed(self) -> Observer:
+        """The deployed observer."""
+        return Observer.load(self.store.path(*DEPLOYED))
+
+    @cached_property
     def evaluation(self) -> Record:
         """What the evaluate stage left: errors of observers and baselines."""
         return load_artifact(self.store.path("evaluation"), "evaluation")[0]
+
+
+@contextmanager
+def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[Context]:
+    """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
+    load_run(folder)
+    with locked(folder, shared=not alone):
+        config, store = load_run(folder)
+        store.verify(*stages)
+        yield Context(config, store, Work())
 
 
 log = logging.getLogger(__name__)
@@ -108,8 +128,8 @@ def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str]) -
     """Run a step, or find it done."""
     store, digest, progress = context.store, digests[step.stage], context.work.progress
     if (artefact := store.stored(digest)) is not None:
-        record = store.record(step.stage)
-        if record is None or record.digest != digest:
+        known = store.manifest.get(step.stage)
+        if known is None or known.digest != digest:
             _outdate(context, digests)
         store.add(step.stage, artefact)
         progress.finish(step.stage, artefact.seconds, skipped=True)

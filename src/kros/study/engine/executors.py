@@ -17,9 +17,10 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from functools import partial
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 from ...core import ConfigError, Executor, KrosError, MissingDependencyError, Progress, frozen
+from ...core.arrays import T
 from .store import code_key
 
 
@@ -53,7 +54,6 @@ class Lines(Progress):
             sys.stderr.flush()
 
 
-T = TypeVar("T")
 log = logging.getLogger(__name__)
 _BATCHES, _LARGEST = 1000, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
@@ -65,11 +65,12 @@ _GIVEN_UP = (
 )
 
 
+@frozen
 class DaskExecutor(Executor):
     """Runs tasks on a Dask cluster, in batches where they are many."""
 
-    def __init__(self, client: Any, address: str) -> None:
-        self._client, self._address = client, address
+    client: Any
+    address: str
 
     def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Yield results in the order of the tasks, which run again elsewhere where a worker ends."""
@@ -79,7 +80,7 @@ class DaskExecutor(Executor):
         size = min(_LARGEST, -(-len(tasks) // _BATCHES)) or 1
         batches = [tasks[start : start + size] for start in range(0, len(tasks), size)]
         try:
-            futures = self._client.map(partial(run_batch, code_key(), function), batches, pure=False)
+            futures = self.client.map(partial(run_batch, code_key(), function), batches, pure=False)
         except ClosedClientError as error:
             raise self._error(_LOST) from error
         return self._results(deque(futures))
@@ -97,7 +98,7 @@ class DaskExecutor(Executor):
             raise self._error(_LOST) from error
 
     def _error(self, text: str) -> KrosError:
-        return KrosError(f"Dask scheduler {self._address}: {text}")
+        return KrosError(f"Dask scheduler {self.address}: {text}")
 
 
 def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> list[T]:

@@ -31,6 +31,7 @@ from .lock import locked
 log = logging.getLogger(__name__)
 
 STORE = "store"
+DEPLOYED = ("observers", "deployed.json")
 STUDY, METRICS = "study.json", "metrics.json"  # of a run, and of no stage
 
 
@@ -68,10 +69,6 @@ class Store:
         """Return the run folder of a study that the running stage makes in its draft."""
         return Store(self.draft(*parts), shared=self.artefacts)
 
-    def record(self, stage: str) -> Artefact | None:
-        """Return the artefact of a finished stage, or None."""
-        return self.manifest.get(stage)
-
     def files(self) -> frozenset[str]:
         """Return the names of all files that belong to the run."""
         return recorded_files(self.folder)
@@ -89,13 +86,15 @@ class Store:
         return content
 
     def verify(self, *stages: str) -> None:
-        """Make sure that what some finished stages, or all, wrote is as they left it."""
-        manifest = read_manifest(self.folder)
-        for stage in [stage for stage in stages or manifest if stage in manifest]:
-            artefact = manifest[stage]
-            for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
-                reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
-                raise DataError(f"Run: {self.path(name)}, which stage {stage} wrote, {reason}; run the study again.")
+        """Make sure that what some finished stages wrote is as they left it, by default all but the report."""
+        for stage, artefact in read_manifest(self.folder).items():
+            wanted = stage in stages if stages else stage != Stage.REPORT  # `kros report` writes it again
+            for name in artefact.files if wanted else ():
+                if not artefact.matches(self.folder, name):
+                    reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
+                    raise DataError(
+                        f"Run: {self.path(name)}, which stage {stage} wrote, {reason}; run the study again."
+                    )
 
     def stored(self, digest: str) -> Artefact | None:
         """Return an artefact that is in the store, whole."""
@@ -129,10 +128,9 @@ class Store:
 
     def add(self, stage: str, artefact: Artefact) -> None:
         """Name an artefact of the store in the manifest, in place of an earlier one, and put its files into place."""
-        entry, earlier = artefact.model_copy(update={"results": ()}), self.record(stage)
-        if earlier != entry:
-            if earlier is not None and earlier.digest != entry.digest:
-                self.drop(stage)
+        entry = artefact.model_copy(update={"results": ()})
+        if self.manifest.get(stage) != entry:
+            self.drop(stage)
             write_manifest(self.folder, self.manifest | {stage: entry})
         for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
             self._link(self.artefacts / artefact.digest / name, place(self.folder, name))
@@ -264,23 +262,13 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
                     write_json(store.path(STUDY), config.dump())
                 yield store
             except (ConfigError, DataError, DimensionError):
-                if fresh and store.record(Stage.READ) is None:
+                if fresh and Stage.READ not in store.manifest:
                     store.remove()
                 raise
     finally:
         with suppress(OSError):  # it is not empty, as a rule
             for folder in above:
                 folder.rmdir()
-
-
-@contextmanager
-def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[tuple[StudyConfig, Store]]:
-    """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
-    load_run(folder)
-    with locked(folder, shared=not alone):
-        config, store = load_run(folder)
-        store.verify(*stages)
-        yield config, store
 
 
 def load_run(folder: Path) -> tuple[StudyConfig, Store]:

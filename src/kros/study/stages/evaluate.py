@@ -10,7 +10,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ...core import AnyArray, Array, ByName, KrosError, Names, Record, save_artifact
+from ...core import AnyArray, Array, KrosError, Names, Record, save_artifact
+from ...data import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
@@ -27,33 +28,28 @@ Pieces = dict[Names, Callable[[], Any]]  # work by the names of its results
 
 def run(context: Context) -> None:
     """Evaluate and save errors and the trajectories that are displayed."""
-    facts, population, roles = context.facts, context.population, unit_roles(context)
-    known, models = context.identified.parameters, context.identified.models()
-    units = {u: known[u] for u in facts.groups if u in models.unit_ids}
+    facts, population, identified = context.facts, context.population, context.identified
+    units = {u: identified.parameters[u] for u in facts.groups if u in identified.models().unit_ids}
     keys = tuple(k for k in facts.test if k.unit in units)
-    episodes = HeldOut(population, keys, units, sensor=context.config.sensor)
+    episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(context))
     episodes = replace(episodes, shown=showcase(context, episodes))
-    home = [i for i, k in enumerate(keys) if k.condition == facts.identify_on]
-    at_home = replace(
-        episodes, keys=tuple(keys[i] for i in home), shown=tuple(home.index(i) for i in episodes.shown if i in home)
-    )
+    at_home = replace(episodes, keys=tuple(k for k in keys if k.condition == facts.identify_on))
     observers = load_observers(context)
-    kinds = {name: context.identified.models(name) for name in context.identified.kinds}
     work = estimation(context, episodes)
-    work |= {(f"free run/{name}",): partial(at_home.models, one) for name, one in kinds.items()}
+    work |= {(f"free run/{name}",): partial(at_home.models, identified.models(name)) for name in identified.kinds}
     results = outcomes(context, work)
-    free_runs: dict[str, Outcome] = {name: results.pop(f"free run/{name}") for name in kinds}  # type: ignore[misc]
-    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
-    band = band_hz(context)
+    free_runs = {name: results.pop(f"free run/{name}") for name in identified.kinds}
+    pooled = {u: "off_nominal" for u in facts.pooled} | {context.uncertain.nominal: "nominal"}
+    roles = {u: pooled.get(u, "outlier") for u in facts.groups}
     content: Record = {
-        "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles, band)],
+        "rows": [row for item in results.items() for row in episodes.rows(*item, roles)],
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
-        "band_hz": band,
-        "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in episodes.shown)],
-        "baselines": {name: facts_of(name, outcome) for name, outcome in results.items() if name not in observers},
+        "band_hz": episodes.band_hz,
+        "shown": [[k.unit, k.condition, k.episode] for k in episodes.shown],
+        "baselines": {name: outcome.facts for name, outcome in results.items() if name not in observers},
         **episodes.recorded_rows(roles),
     }
-    arrays = _arrays(episodes, estimates, free_runs)
+    arrays = _arrays(episodes, results, free_runs)
     save_artifact(context.store.draft("evaluation"), "evaluation", content, arrays)
     run_load(context, observers)
 
@@ -67,21 +63,24 @@ def estimation(context: Context, episodes: HeldOut) -> Pieces:
     return work
 
 
-def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome | str:
+def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome:
     """Make a baseline and run it; return the reason where it cannot be made."""
     try:
         baseline = make()
     except KrosError as error:
-        return str(error)
+        return Outcome(facts={"status": "failed", "reason": str(error)})
     (outcome,) = episodes.estimates(lambda *batch: [baseline.estimate(*batch)[None]], baseline.measured)
     return replace(outcome, facts=baseline.facts, estimated=baseline.estimated)
 
 
-def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:
+def outcomes(context: Context, work: Pieces) -> dict[str, Outcome]:
     """Do the work; return outcomes by name, observers of the study first, in its order."""
-    by_name = dict[str, Outcome | str]()
+    by_name = dict[str, Outcome]()
     for names, result in zip(work, context.work.run("evaluate", work.values()), strict=True):
         by_name |= dict(zip(names, result if isinstance(result, list) else [result], strict=True))
+    for name, outcome in by_name.items():
+        if outcome.facts.get("status") == "failed":
+            log.info("%s could not be computed: %s", name, outcome.facts["reason"])
     return {name: by_name[name] for name in dict.fromkeys((*context.observers_record["names"], *by_name))}
 
 
@@ -101,14 +100,6 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
 
 
-def facts_of(name: str, result: Outcome | str) -> ByName:
-    """Return what the records say about a baseline that was made here."""
-    if isinstance(result, Outcome):
-        return result.facts
-    log.info("%s could not be computed: %s", name, result)
-    return {"status": "failed", "reason": result}
-
-
 def band_hz(context: Context) -> tuple[float, float] | None:
     """Return the band around the gearbox frequency at the population's top speed; None for other plants."""
     spec = context.phase_spec
@@ -119,13 +110,7 @@ def band_hz(context: Context) -> tuple[float, float] | None:
     return gearbox_band_hz(context.config.calibrate, context.population, top_speed)
 
 
-def unit_roles(context: Context) -> dict[str, str]:
-    """Return for every unit whether it is the nominal one, another of the population, or filed as an outlier."""
-    pooled = {u: "off_nominal" for u in context.facts.pooled} | {context.uncertain.nominal: "nominal"}
-    return {u: pooled.get(u, "outlier") for u in context.facts.groups}
-
-
-def showcase(context: Context, episodes: HeldOut) -> tuple[int, ...]:
+def showcase(context: Context, episodes: HeldOut) -> tuple[EpisodeKey, ...]:
     """Choose the episodes to display: nominal, worst off-nominal, and the nominal unit in every other condition."""
     home, uncertain = context.facts.identify_on, context.uncertain
     others = sorted({k.condition for k in episodes.keys} - {home})
@@ -137,11 +122,9 @@ def showcase(context: Context, episodes: HeldOut) -> tuple[int, ...]:
 
 def free_run_percent(outcome: Outcome, episodes: HeldOut, pooled: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return median and worst free-run error over the pooled units, channel by channel."""
-    places = {unit: rows for (unit, _), rows in episodes.groups.items()}
-    per_unit = np.array([outcome.summary.percent[places[u]].mean(axis=0) for u in pooled if u in places])
-    median, worst = np.median(per_unit, axis=0), per_unit.max(axis=0)
-    states = episodes.population.states
-    return {c: {"median": float(m), "worst": float(w)} for c, m, w in zip(states, median, worst, strict=True)}
+    rows = [row for row in episodes.rows("", outcome, dict.fromkeys(episodes.parameters, "")) if row["unit"] in pooled]
+    errors = {c: [r["error_percent"] for r in rows if r["channel"] == c] for c in episodes.population.states}
+    return {c: {"median": float(np.median(of)), "worst": max(of)} for c, of in errors.items()}
 
 
 def load_observers(context: Context) -> dict[str, Observer]:
@@ -155,11 +138,11 @@ def _arrays(
 ) -> dict[str, AnyArray]:
     """Collect the trajectories that figures need, in single precision."""
     arrays = dict[str, Array]()
-    for number, i in enumerate(episodes.shown):
+    for number, key in enumerate(episodes.shown):
         start = f"shown{number}"
-        arrays[f"{start}/states"], arrays[f"{start}/inputs"] = episodes.population.read_parts(episodes.keys[i])
-        arrays |= {f"{start}/observer/{name}": outcome.shown[number] for name, outcome in estimates.items()}
-        free = {name: outcome for name, outcome in free_runs.items() if number < len(outcome.shown)}
-        arrays |= {f"{start}/model/{name}": outcome.shown[number] for name, outcome in free.items()}
+        arrays[f"{start}/states"], arrays[f"{start}/inputs"] = episodes.population.read_parts(key)
+        for kind, results in (("observer", estimates), ("model", free_runs)):
+            shown = {f"{start}/{kind}/{name}": outcome.shown for name, outcome in results.items()}
+            arrays |= {name: of[key] for name, of in shown.items() if key in of}
     with np.errstate(over="ignore"):  # an estimate that diverged becomes infinite
         return {name: values.astype(np.float32) for name, values in arrays.items()}

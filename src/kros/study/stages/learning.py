@@ -13,9 +13,8 @@ from ...evaluate.over_units import draw_reserve
 from ...identify import IdentifiedModels
 from ...identify.calibration import calibrate
 from ...identify.identify import with_models
-from ...identify.presets import resolve_lifting, resolve_phase
-from ...identify.survey import Copy, check_usable, survey
-from ...observer import require_measured
+from ...identify.presets import resolve_lifting
+from ...identify.survey import Copy, survey
 from ...observer.residual import FEWEST_SAMPLES
 from ...uncertainty import quantify
 from ..config import Stage, StudyConfig
@@ -62,43 +61,26 @@ def draw(config: StudyConfig, population: Population) -> Names:
     return draw_reserve(free, n)
 
 
-def taking_part(config: StudyConfig, population: Population) -> Population:
-    """Return a population without the units in reserve."""
-    reserve = draw(config, population)
-    return population.select([u for u in population.unit_ids if u not in reserve])
-
-
-def check_source(config: StudyConfig, population: Population, single_allowed: bool) -> None:
-    """Refuse what can be refused from names alone, before anything is written."""
-    check_usable(population, config.split.test, config.data.identify_on, single_allowed)
-    population = taking_part(config, population)
-    resolve_phase(
-        config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
-    )
-    require_measured(config.sensor, population.measured)
-
-
 def run_read(context: Context) -> None:
     """Read everything once."""
-    config = context.config
-    in_place, store = config.data.reader == PARQUET and not config.data.prepare, context.store
+    config, data, store = context.config, context.config.data, context.store
+    in_place, test = data.reader == PARQUET and not data.prepare, config.split.test
     copy = None if in_place else Copy(store.draft("recordings"), store.path("recordings"))
-    population, data = open_source(config, context.given), config.data
-    lifting = resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
-    options = {"test": config.split.test, "identify_on": data.identify_on, "on_nan": data.on_nan}
-    fewest, reserve = fewest_samples(lifting.history), draw(config, population)
-    _, facts = survey(population, context.work, copy, reserve=reserve, fewest=fewest, **options)
+    population = open_source(config, context.given)
+    lifting = resolve_lifting(config.lifting, config.calibrate, population, test)
+    options = {"identify_on": data.identify_on, "on_nan": data.on_nan, "reserve": draw(config, population)}
+    fewest = fewest_samples(lifting.history)
+    _, facts = survey(population, context.work, copy, test=test, fewest=fewest, **options)
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")
-    content = {"recordings": config.data.source if in_place else "recordings", **facts.content()}
-    save_artifact(context.store.draft("population"), "facts", content)
+    content = {"recordings": data.source if in_place else "recordings", **facts.content()}
+    save_artifact(store.draft("population"), "facts", content)
 
 
 def run_calibrate(context: Context) -> None:
     """Calibrate the phase of every unit, where the lifting has one."""
-    given, spec = context.models, context.phase_spec
+    known, spec = context.models and context.models.calibration, context.phase_spec
     if spec is not None:
-        known = given and given.calibration
         calibration = known or calibrate(context.population, context.facts, spec, context.work)
         calibration.save(context.store.draft("calibration"))
 

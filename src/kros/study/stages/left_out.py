@@ -18,15 +18,14 @@ from functools import partial
 import numpy as np
 
 from ...core import ConfigError, IdentificationError, KrosError, Progress, Record, load_artifact, save_artifact
-from ...data import OUTLIERS, Population, split_episodes
-from ...evaluate.held_out import HeldOut, Outcome
+from ...data import split_episodes
+from ...evaluate.held_out import HeldOut
 from ...evaluate.over_units import fewest_units, next_unit_bound
 from ...identify.calibration import Values, unit_parameters
 from ...identify.identified import recordings_of, recordings_path
-from ...observer import Observer
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
-from .evaluate import band_hz, estimation, facts_of, outcomes
+from .evaluate import band_hz, estimation, outcomes
 from .learning import FEWEST, LEARNING
 
 log = logging.getLogger(__name__)
@@ -39,12 +38,6 @@ Rows = list[Record]
 def wanted(config: StudyConfig) -> bool:
     """Tell whether a study leaves units out."""
     return config.evaluate.folds > 0 or config.evaluate.reserve > 0
-
-
-def check_folds(config: StudyConfig, population: Population) -> None:
-    """Refuse more folds than there are units, or so few that one of them leaves no population to learn from."""
-    if config.evaluate.folds:
-        parted([u.id for u in population.units if u.group != OUTLIERS], config.evaluate.folds)
 
 
 def parted(units: Sequence[str], folds: int) -> list[list[str]]:
@@ -71,7 +64,7 @@ def run(context: Context) -> None:
 def results(context: Context) -> Record:
     """Return what the stage adds to the metrics."""
     parts = {FOLDER: context.config.evaluate.folds, NEXT: context.config.evaluate.reserve}
-    return {name: load_artifact(context.store.path(name), name)[0] for name, n in parts.items() if n}
+    return {name: load_artifact(context.store.path(name), name)[0] for name, count in parts.items() if count}
 
 
 def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> Record:
@@ -118,11 +111,10 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     facts, population, record = whole.facts, whole.population.select(held), context.observers_record
     units = unit_parameters(population, context.calibration, facts.identify_on, facts)
     keys = tuple(k for k in facts.test if k.unit in held)
-    episodes = HeldOut(population, keys, units, sensor=context.config.sensor)
-    results, band, roles = outcomes(context, estimation(context, episodes)), band_hz(whole), dict.fromkeys(held, FOLDER)
-    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
-    rows = [row for item in estimates.items() for row in episodes.rows(*item, roles, band)]
-    others = {name: facts_of(name, outcome) for name, outcome in results.items() if name not in record["facts"]}
+    episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(whole))
+    results, roles = outcomes(context, estimation(context, episodes)), dict.fromkeys(held, FOLDER)
+    rows = [row for item in results.items() for row in episodes.rows(*item, roles)]
+    others = {name: outcome.facts for name, outcome in results.items() if name not in record["facts"]}
     parameters = {unit: values for unit, values in units.items() if values}
     content = {"units": held, "parameters": parameters, "rows": rows, "observers": {**record["facts"], **others}}
     save_artifact(context.store.draft("evaluation"), KIND, content)
@@ -130,15 +122,15 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
 
 def next_unit(context: Context) -> Record:
     """Run the deployed observer on the units in reserve; return what their errors say about the next unit."""
-    config, facts, population = context.config.evaluate, context.facts, context.population
-    deployed, evaluated = context.observers_record["deployed"], context.evaluation["rows"]
+    confidence, facts, population = context.config.evaluate.confidence, context.facts, context.population
+    deployed, home = context.observers_record["deployed"], facts.identify_on
     rows, failed = reserve_rows(context, deployed)
-    known = [r for r in evaluated if r["observer"] == deployed and r["unit"] in facts.pooled]
+    known = [r for r in context.evaluation["rows"] if r["observer"] == deployed and r["unit"] in facts.pooled]
     hidden = [c for c in population.states if c not in population.measured] or list(population.states)
-    reserved, pooled = ([r for r in part if r["condition"] == facts.identify_on] for part in (rows, known))
-    content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": config.confidence}
-    content |= {"observer": deployed, "condition": facts.identify_on, "rows": rows, "failed": failed}
-    return content | bounds_of(reserved, pooled, hidden, config.confidence)
+    reserved, pooled = ([r for r in part if r["condition"] == home] for part in (rows, known))
+    content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": confidence}
+    content |= {"observer": deployed, "condition": home, "rows": rows, "failed": failed}
+    return content | bounds_of(reserved, pooled, hidden, confidence)
 
 
 def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]:
@@ -147,19 +139,16 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     splits = split_episodes(whole, context.config.split.test).values()
     train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
     facts = replace(facts, groups=dict.fromkeys(facts.reserve, ""), train=train, test=test, reserve=())
-    known: Values = {}
-    failed = dict[str, str]()
+    known, failed, rows = Values(), dict[str, str](), Rows()
     for unit in facts.groups:
         try:
             known |= unit_parameters(whole.select([unit]), context.calibration, facts.identify_on, facts)
         except IdentificationError as error:
             failed[unit] = str(error)
-    keys, rows = tuple(k for k in test if k.unit in known), Rows()
-    if keys:
-        observer = Observer.load(context.store.path("observers", "deployed.json"))
-        episodes = HeldOut(whole, keys, known, sensor=context.config.sensor)
-        (outcome,) = episodes.observers([observer])
-        rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"), band_hz(context))
+    if keys := tuple(k for k in test if k.unit in known):
+        episodes = HeldOut(whole, keys, known, sensor=context.config.sensor, band_hz=band_hz(context))
+        (outcome,) = episodes.observers([context.deployed])
+        rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"))
     lost = dict.fromkeys((k.unit, k.condition) for k in test if k.unit in failed)
     base = {"observer": deployed, "role": "reserve"} | dict.fromkeys(_MEASURES, float("inf"))
     return rows + [{**base, "unit": u, "condition": c, "channel": s} for u, c in lost for s in whole.states], failed
@@ -167,22 +156,22 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
 
 def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> Record:
     """Bound the next unit's errors in some channels, in percent and in RMS, all together."""
-    places = [(c, m) for c in channels for m in _MEASURES]
-    scale = {(c, m): np.mean([r[m] for r in known if r["channel"] == c] or [np.nan]) for c, m in places}
-    usable = [place for place, size in scale.items() if np.isfinite(size) and size > 0]
-    units, needed, bounds = list(dict.fromkeys(r["unit"] for r in rows)), fewest_units(confidence), None
-    if not usable:
+    places = [(channel, measure) for channel in channels for measure in _MEASURES]
+    errors, pooled = ({(c, m): [r[m] for r in of if r["channel"] == c] for c, m in places} for of in (rows, known))
+    scale = {place: float(np.mean(of)) for place, of in pooled.items() if of}
+    scale = {place: size for place, size in scale.items() if np.isfinite(size) and size > 0}
+    units, needed, bounds = len({r["unit"] for r in rows}), fewest_units(confidence), None
+    if not scale:
         reason = "the observer has no finite error on the units that it was made from"
-    elif len(units) < needed:
-        reason = f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}"
+    elif units < needed:
+        reason = f"{units} units in reserve, and a confidence of {confidence:g} needs {needed}"
     else:
-        errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
-        of_units = [[errors[u, c, m] for c, m in usable] for u in units]
-        bounds = next_unit_bound(of_units, [float(scale[p]) for p in usable], confidence)
+        of_units = np.array([errors[place] for place in scale], dtype=float).T
+        bounds = next_unit_bound(of_units, list(scale.values()), confidence)
         reason = "the observer diverges on too many of the units in reserve, or they cannot be calibrated"
     if bounds is None or not np.isfinite(bounds).all():
         return {"bounds": None, "reason": reason}
-    values = dict(zip(usable, bounds.tolist(), strict=True))
+    values = dict(zip(scale, bounds.tolist(), strict=True))
     return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
 
 
@@ -191,10 +180,9 @@ def facts_of_folds(folds: Sequence[dict[str, Record]]) -> dict[str, Record]:
     facts = {}
     for name in dict.fromkeys(name for fold in folds for name in fold):
         entries = [fold[name] for fold in folds if name in fold]
-        designed = [e for e in entries if e.get("status") != "failed"]
-        observers = [e for e in designed if "relift_certified" in e]
+        observers = [e for e in entries if e.get("status") != "failed" and "relift_certified" in e]
         facts[name] = {
-            "made": len(designed),
+            "made": sum(e.get("status") != "failed" for e in entries),
             "orders": sorted({e["order"] for e in observers}),
             "relift_certified": sum(bool(e["relift_certified"]) for e in observers) if observers else None,
             "robust": sum(e.get("worst_case_h2") is not None for e in observers) if observers else None,

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from ...core import Array, Columns, ConfigError, KrosError, Names, Record, frozen, load_artifact, save_artifact
+from ...core import Array, ConfigError, KrosError, Record, frozen, load_artifact, save_artifact
 from ...data import EpisodeBatch
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
@@ -50,12 +50,13 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     """Make and judge the estimators of the load, and save them with their errors; nothing without a declared load."""
     if context.config.load.moment is None:
         return
-    trial = LoadTrial.of(context)
-    makers = {f"{kind}/{LOAD}": partial(_with_load, context, trial, kind, lifting) for kind, lifting in trial.liftings}
-    names = [f"{kind}/{TRIAL.unaware}" for kind, _ in trial.liftings]
+    trial, liftings = LoadTrial.of(context), {"linear": Lifting(context.population.states)}
+    if context.lifting.functions:
+        liftings = {"koopman": context.lifting, **liftings}
+    makers = {f"{kind}/{LOAD}": partial(_with_load, trial, kind, lifting) for kind, lifting in liftings.items()}
+    names = [f"{kind}/{TRIAL.unaware}" for kind in liftings]
     makers |= {f"{n}/current": partial(_from_current, trial, observers[n]) for n in names if n in observers}
-    curves = dict[str, Array]()
-    facts = dict[str, Record]()
+    curves, facts = dict[str, Array](), dict[str, Record]()
     for name, make in makers.items():
         try:
             curves[name], fact = make()
@@ -64,10 +65,17 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
             log.info("%s could not be computed: %s", name, error)
         facts |= {name: fact} if fact else {}
     shown = next(i for i, key in enumerate(trial.test.keys) if key.condition == TRIAL.condition)
-    key, arrays = trial.test.keys[shown], {"truth": trial.truth[1]} | {f"estimate/{n}": v for n, v in curves.items()}
-    content = {"known": trial.known, "rows": [trial.row(*item) for item in curves.items()], "observers": facts}
-    content |= {"corner_hz": TRIAL.judged_hz, "settle_s": TRIAL.settle_s, "estimates": list(curves)}
-    content["shown"] = [key.unit, key.condition, key.episode]
+    key = trial.test.keys[shown]
+    content = {
+        "known": trial.known,
+        "rows": [trial.row(*item) for item in curves.items()],
+        "observers": facts,
+        "corner_hz": TRIAL.judged_hz,
+        "settle_s": TRIAL.settle_s,
+        "estimates": list(curves),
+        "shown": [key.unit, key.condition, key.episode],
+    }
+    arrays = {"truth": trial.truth[1]} | {f"estimate/{n}": values for n, values in curves.items()}
     single = {name: values[:, shown].astype(np.float32) for name, values in arrays.items()}
     save_artifact(context.store.draft(LOAD), LOAD, content, single)
 
@@ -80,19 +88,20 @@ def load_metrics(context: Context) -> Record:
     return {"load_torque": {key: content[key] for key in ("known", "corner_hz", "settle_s", "observers", "rows")}}
 
 
-def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, Record]:
+def _with_load(trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, Record]:
     """Return the load of an observer that has it as a state, with its level, and facts; save the observer."""
-    (angle, current), test, inputs = trial.places, trial.test, context.population.inputs
-    leveled = angle_load(context.config.estimator, trial.dt)
+    context, (angle, current), test = trial.context, trial.places, trial.test
+    identified, inputs = context.identified, context.population.inputs
+    measured, leveled = identified.models().measured, angle_load(context.config.estimator, test.sample_period_s)
     read = LoadSettings(current, leveled.level_s, TRIAL.corner_hz, leveled.limit)
-    observer, left_out = load_observer(
-        f"{kind}/{LOAD}", lifting, trial.measured, inputs, trial.train, trial.truth[0], read
-    )
-    observer = replace(observer, seen=seen_by(context.identified, observer.measured))
+    observer, left_out = load_observer(f"{kind}/{LOAD}", lifting, measured, inputs, trial.train, trial.truth[0], read)
+    nominal = identified.parameters[context.uncertain.nominal]
+    seen = seen_by(identified, observer.measured)
+    observer = replace(observer, seen=seen, parameters={n: nominal[n] for n in lifting.parameters})
     observer.save(context.store.draft(LOAD, f"{kind}.json"))
-    estimate = run_observer(observer, test.measurements(trial.measured), test.inputs, observer.own(test.parameters))
-    seen = estimate[..., observer.lifting.states.index("load")]
-    load = leveled.run(seen, estimate[..., current], test.states[..., angle]).load
+    estimate = run_observer(observer, test.measurements(measured), test.inputs, observer.own(test.parameters))
+    estimated = estimate[..., observer.lifting.states.index("load")]
+    load = leveled.run(estimated, estimate[..., current], test.states[..., angle]).load
     return load, {"order": observer.internal, "episodes_left_out": len(left_out)}
 
 
@@ -106,60 +115,53 @@ def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, Record]:
     """Return the paper's estimate: the error of the current, scaled where the load is known."""
     current, errors = trial.places[1], []
     for batch in (trial.train, trial.test):
-        y = as_arriving(batch, observer.sensor, trial.states).measurements(observer.measured)
+        y = as_arriving(batch, observer.sensor, trial.context.population.states).measurements(observer.measured)
         estimate = run_observer(observer, y, batch.inputs, observer.own(batch.parameters))
         errors.append(batch.states[..., current] - estimate[..., current])
     loaded = [i for i, k in enumerate(trial.train.keys) if k.condition == TRIAL.condition]
-    scale = TorqueScale.calibrated(errors[0][:, loaded], trial.truth[0][:, loaded], trial.dt)
-    return scale.load(errors[1]), {}
+    known = errors[0][:, loaded], trial.truth[0][:, loaded]
+    return TorqueScale.calibrated(*known, trial.test.sample_period_s).load(errors[1]), {}
 
 
 @frozen
 class LoadTrial:
     """Recordings of a study with the load that is declared."""
 
+    context: Context
     known: list[str]  # units
-    states: Names
-    measured: Columns
     train: EpisodeBatch
     test: EpisodeBatch
-    truth: tuple[Array, Array]  # of both, in units of current
-    dt: float
-    liftings: list[tuple[str, Lifting]]
+    truth: list[Array]  # of both, in units of current
 
     @classmethod
     def of(cls, context: Context) -> LoadTrial:
         """Read the recordings; refuse a study without a known load, or without other units to judge on."""
-        facts, population = context.facts, context.population
+        facts, population, units = context.facts, context.population, context.identified.parameters
         if missing := [name for name in (TRIAL.angle, TRIAL.current) if name not in population.states]:
             states = ", ".join(population.states)
             raise ConfigError(f"Load: there is no state {missing[0]!r} in {states}; give the channel this name.")
-        units = context.identified.parameters
         usable = [u for u in facts.pooled if u in units]
         known, others = _known(context, usable)
         free, loaded = facts.identify_on, TRIAL.condition
         places = {free: usable, loaded: [*known, *(usable if free == loaded else ())]}
         train = [k for k in facts.train if k.unit in places.get(k.condition, ())]
         test = [k for k in facts.test if k.unit in others and k.condition in (free, loaded)]
-        batches = (EpisodeBatch.read(population, keys, parameters=units) for keys in (train, test))
+        batches = [EpisodeBatch.read(population, keys, parameters=units) for keys in (train, test)]
         first, second = (batch.head(int(batch.lengths.min())) for batch in batches)
-        truth = _truth(context, first), _truth(context, second)
-        linear = [("linear", Lifting(population.states))]
-        liftings = [("koopman", context.lifting), *linear] if context.lifting.functions else linear
-        measured, dt = context.identified.models().measured, population.sample_period_s
-        return cls(known, population.states, measured, first, second, truth, dt, liftings)
+        return cls(context, known, first, second, [_truth(context, batch) for batch in (first, second)])
 
     @property
     def places(self) -> tuple[int, int]:
         """Places of angle and current among the states."""
-        return self.states.index(TRIAL.angle), self.states.index(TRIAL.current)
+        states = self.context.population.states
+        return states.index(TRIAL.angle), states.index(TRIAL.current)
 
     def row(self, name: str, estimate: Array) -> Record:
         """Return errors of an estimate for the metrics."""
-        skip = round(TRIAL.settle_s / self.dt)
-        accuracy = load_accuracy(estimate, self.truth[1], self.dt, TRIAL.judged_hz, skip)
-        row = {"observer": name} | {name: getattr(accuracy, name) for name in ("load_rms", "floor_rms", "error_rms")}
-        return row | {"error_percent": accuracy.percent, "error_to_floor": accuracy.ratio}
+        dt = self.test.sample_period_s
+        accuracy = load_accuracy(estimate, self.truth[1], dt, TRIAL.judged_hz, round(TRIAL.settle_s / dt))
+        errors = {"error_percent": accuracy.percent, "error_to_floor": accuracy.ratio}
+        return {"observer": name, **vars(accuracy), **errors}
 
 
 def _known(context: Context, usable: list[str]) -> tuple[list[str], list[str]]:
@@ -178,9 +180,7 @@ def _known(context: Context, usable: list[str]) -> tuple[list[str], list[str]]:
 
 def _truth(context: Context, batch: EpisodeBatch) -> Array:
     """Return the load that is declared, on episodes in its condition."""
-    config, population = context.config.load, context.population
-    position = batch.states[..., population.states.index(TRIAL.angle)]
-    torque = known_load(
-        position, population.sample_period_s, float(config.moment or 0.0), config.inertia, TRIAL.corner_hz
-    )
+    config, place = context.config.load, context.population.states.index(TRIAL.angle)
+    position = batch.states[..., place]
+    torque = known_load(position, batch.sample_period_s, config.moment or 0.0, config.inertia, TRIAL.corner_hz)
     return np.where([k.condition == TRIAL.condition for k in batch.keys], torque, 0.0)

@@ -7,12 +7,10 @@ from pathlib import Path
 
 from ...core import Progress
 from ..config import Stage
-from ..engine.context import Context
+from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
-from ..engine.store import open_finished
 
 REPORT = "report.html"
-_SHOWN = [stage for stage in Stage if stage is not Stage.REPORT]
 
 
 def run(context: Context) -> None:
@@ -28,13 +26,13 @@ def render_run(folder: Path, workers: int) -> Path:
     """Write the report of a finished run again; `workers` processes draw its figures."""
     from ...report.html import render
 
-    with open_finished(folder, *_SHOWN, alone=True) as (_, store), open_executor(workers) as executor:
-        return render(store.folder, store.metrics(), executor.map)
+    with open_finished(folder, alone=True) as context, open_executor(workers) as executor:
+        return render(folder, context.store.metrics(), executor.map)
 
 
 def write_figures(folder: Path, out: Path, progress: Progress | None = None) -> list[str]:
     """Write the figures of a finished run as PNG and PDF."""
     from ...report import files
 
-    with open_finished(folder, *_SHOWN):
+    with open_finished(folder):
         return files.write_figures(folder, out, progress)

@@ -65,8 +65,8 @@ set_bound_percent.
     kros.observer: signal_bound SignalBound
 How a load is read and scaled is no longer public; a study with recordings of the condition load estimates load torque.
     kros.motor_drive: LoadSettings TorqueScale known_load load_observer
-Status bits of a batch, monitors, guards, filter banks and observers side by side are internal; step a running observer, read its
-status, and let kros.synthesize make the others.
+Status bits of a batch, monitors, guards, filter banks and observers side by side are internal; step a running observer,
+read its status, and let kros.synthesize make the others.
     kros.observer: run_with_status sample_status Monitor Guard FilterBank run_observers
 The raw layout of motor drives is no longer written by a public function; use kros simulate --format raw.
     kros.data: write_raw

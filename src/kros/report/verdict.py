@@ -104,6 +104,8 @@ def _numbers(facts: Facts) -> list[Number]:
         cell, known = facts.cells[channel], facts.cells[channel].means
         if cell.mean is not None:
             notes = [f"RMS {number(known['rms'])} {facts.unit(channel)}".strip()] if known.get("rms") else []
+            if growth := facts.entry.get("left_out_to_training", {}).get(channel):
+                notes.append(f"in training {growth:.2f} times as large on units left out")
             notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
             if error := known.get("true_error_percent"):
                 notes.append(f"against the true signal: {number(error)} %{_lag(known.get('true_lag_s'))}")

@@ -63,7 +63,7 @@ class RunResult(Shown):
             units = f"{facts.study['units']}, no observer has been designed yet"
             return {"units": units, "check": " ".join(facts.study.get("alerts", ())), **place}
         verdict = judge(facts)
-        numbers = {n.label: f"{n.value} {n.unit} ({n.notes[-1]})" for n in verdict.numbers}
+        numbers = {n.label: f"{n.value} {n.unit} ({'; '.join(n.notes[1:] or n.notes)})" for n in verdict.numbers}
         return {verdict.status.value: verdict.sentence, **numbers, **place}
 
     @property

@@ -208,12 +208,12 @@ class Population(Shown):
 
     @cached_property
     def channels(self) -> Channels:
-        """Columns of every episode: states, then inputs."""
+        """Columns of every episode, states before inputs."""
         return tuple(c for c in self.columns if c.role is not Role.TRUTH)
 
     @property
     def truths(self) -> Channels:
-        """Columns behind them, for evaluation only: what some states really were."""
+        """Columns behind them, for evaluation only, with what some states really were."""
         return self.columns[len(self.channels) :]
 
     @property

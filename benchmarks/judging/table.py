@@ -161,7 +161,8 @@ def verdict(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
     say(
         f"  {name:24s} deployed {made}; certified as it runs {proofs[0]}, for the set of signals {proofs[1]} of {len(parts)}"
     )
-    bounds(name, "deployed", deployed)
+    for observer in dict.fromkeys(p["deployed"] for p in parts):
+        bounds(name, observer, parts)
     for condition, channel in product(conditions, hidden):
         values = paired(*(errors(parts, o, condition, channel) for o in ("deployed", LEARNED)))
         what = f"{channel}, {condition}"

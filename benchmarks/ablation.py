@@ -52,7 +52,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "settled_share = 0.001": {"settled_share": 1e-3},
     "nonlinear_trust = 0": {"nonlinear_trust": 0.0},
     "gap_share = 0": {"gap_share": 0.0},
-    "lost_share = 0": {"lost_share": 0.0},
     "restart_share = 1e-5": {"restart_share": 1e-5},
     "beyond = 0": {"beyond": 0.0},
     "penalties = [1e-16]": {"penalties": (1e-16,)},

@@ -439,3 +439,34 @@ def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():
         x = (lifted[0] @ model.A.T + lifted[1] @ model.B.T)[:, :2]
     rms = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
     assert (rms[0] <= 1.2 * rms[1]).all()
+
+
+@pytest.fixture(scope="module")
+def two_sensors():
+    """A motor of which position and current are measured."""
+    motors = kros.plants.DcMotorPopulation(n_units=4, n_episodes=4, seconds=1.0, seed=3).simulate().population
+    keys = list(motors.keys())
+    recordings = Recordings.of(keys, lambda key: EpisodeBatch.read(motors, [key]))
+    observer = identify_estimator(
+        "motor", Lifting(motors.states), (0, 2), motors.inputs, recordings, motors.sample_period_s, settings=FEW
+    ).observer
+    return observer, EpisodeBatch.read(motors, keys)
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_one_of_two_sensors_that_is_lost_for_ever_leaves_the_estimate_bounded(two_sensors, lost):
+    observer, batch = two_sensors
+    again = 40
+    y, u = (np.tile(part, (again, 1, 1)) for part in (batch.states[..., [0, 2]], batch.inputs))
+    size = np.abs(batch.states).max(axis=(0, 1))
+    y[200:-200, :, lost] = np.nan
+    estimate = run_observer(observer, y, u)[..., :3]
+    assert (np.abs(estimate) < 3 * size).all()
+
+
+def test_a_filter_bank_starts_at_the_first_sample_with_all_measurements(two_sensors):
+    observer, batch = two_sensors
+    y, u = batch.states[..., [0, 2]].copy(), batch.inputs
+    wanted = run_observer(observer, y[3:], u[3:])
+    y[:3, :, 1] = np.nan
+    np.testing.assert_allclose(run_observer(observer, y, u)[4:], wanted[1:], atol=1e-8 * np.abs(wanted).max())

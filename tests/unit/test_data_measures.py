@@ -186,3 +186,8 @@ def test_every_stretch_above_a_trigger_is_an_episode(tmp_path: Path) -> None:
         read_csv_folder(tmp_path, MAPPING | {"trigger": "enable", "threshold": 9.0})
     with pytest.raises(DataError, match="column 'armed' is missing"):
         read_csv_folder(tmp_path, MAPPING | {"trigger": "armed"})
+
+
+@pytest.mark.parametrize("text", ["pct", "pH", "Ah", "pu", "FS", "PS", "px", "S", "mS", "G", "NA", "ma"])
+def test_what_pint_reads_as_a_unit_of_something_else_is_no_unit(text):
+    assert measure(text) is None

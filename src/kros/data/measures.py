@@ -30,6 +30,10 @@ rad mrad deg ° grad rev turn turns u umdr m mm cm µm μm um km in inch counts 
 kNm Ncm N kN MN Pa kPa MPa hPa bar mbar psi °C degC K °F degF C W kW kg g % - 1 l/min l/s pct percent none bool hex dez
 s sec seconds sek ms msec us µs μs ns min h mbar
 """
+_MORE = """
+degree degrees radian meter metre millimeter second minute hour volt amp amps ampere newton pascal watt kelvin celsius
+degree_Celsius volts hertz kHz MHz GPa kWh mW MW uA uV nA nm mH uH Ohm mF uF nF mT mbar torr atm lbf ft lb t
+"""  # that pint knows too
 _EXPRESSION = re.compile(r"[^\W\d_]+(?:\^-?\d)?(?:[*/ ][^\W\d_]+(?:\^-?\d)?)*")
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
 _AFTER = re.compile(r"^(.+?)(?:\s+in\s+|\s*/\s*|\s*,\s*|\s+)(\S+)$")
@@ -41,6 +45,7 @@ def _pairs(table: str) -> dict[str, str]:
 
 KINDS = _pairs(_SI)
 _PINT = _pairs(_SPELLED)
+_KNOWN = set(re.findall(r"[^\W\d_]+", _SI + _SPELLED + _WORDS + _MORE)) - {"pct", "F", "none", "bool", "hex", "dez"}
 
 
 @dataclass(frozen=True)
@@ -85,12 +90,13 @@ def measure(unit: str) -> Measure | None:
     """Return what a text measures; None where it is no unit of a quantity that kros writes in SI."""
     text = re.sub(r"(?<=[a-zA-Z])([23])$", r"^\1", bare(unit).replace("²", "^2").replace("³", "^3").replace("·", "*"))
     text = _PINT.get(text, _PINT.get(text.lower().replace(" ", ""), text))
-    return _measured(text) or _measured(text.lower())  # Volts, RPM
+    return _measured(text) or (_measured(text.lower()) if len(text) > 2 else None)  # Volts, RPM
 
 
 def _measured(text: str) -> Measure | None:
     """Return what an expression of pint measures."""
-    if not _EXPRESSION.fullmatch(text):  # pint computes what it parses
+    parts = set(re.findall(r"[^\W\d_]+", text))
+    if not _EXPRESSION.fullmatch(text) or not parts <= _KNOWN:  # pint computes what it parses, and pct is a pico-carat
         return None
     registry, names = _registry()
     try:

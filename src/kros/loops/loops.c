@@ -258,13 +258,13 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
     for (whole i = 0; i < recorded; i++)
         for (whole v = 0; v < w; v++) {
             const whole at = i * MOST + v;
-            mask lost = {0}, own = {0};
+            mask lost = {0};
             int hidden = 1;
             for (whole j = 0; j < s->q; j++) {
                 lost |= missing[j * MOST + v];
-                if (s->measured[j] == i) own = missing[j * MOST + v], hidden = 0;
+                hidden &= s->measured[j] != i;
             }
-            const vec share = either(hidden ? lost : own, (vec){0}, 1.0 - hidden * level(gap[at], bank[at]));
+            const vec share = either(lost, (vec){0}, 1.0 - hidden * level(gap[at], bank[at]));
             const vec moved = offset[at] + share * (reg[at] - from_inputs[at] - offset[at]);
             const double most = hidden ? s->reach[i] : INFINITY;
             offset[at] = either(moved > most, (vec){0} + most, either(moved < -most, (vec){0} - most, moved));
@@ -307,7 +307,11 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
             next[at] += begun * (next[(n - 3 * recorded) * MOST + at] - next[at]);
             next[at] = either(next[at] < low, low, either(next[at] > high, high, next[at]));
             gap[at] = either(longest > recovered, longest, recovered);
-            if (hidden) next[at] += level(gap[at], half) * (next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at] - next[at]);
+            const vec fallback = next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at];
+            const vec reach = (vec){0} + s->reach[i], apart = next[at] - fallback;
+            const vec near = fallback + either(apart < -reach, -reach, either(apart > reach, reach, apart));
+            if (hidden) next[at] -= level(gap[at], half) * apart;
+            else next[at] = either(some, near, next[at]);
         }
     }
 }

@@ -7,10 +7,10 @@ internal states are the filters z of measurements and inputs, whose estimate is 
 
 .. math:: o_k \leftarrow o_k + (1 - m) (x_k - x^u_k - o_k), \qquad o_{k+1} = F o_k,
 
-where m is zero for measurements that arrive and one for all that is not measured while some are missing: estimates
-that follow from substitutes do not enter what substitutes follow from. So the fallback :math:`x^u + o` continues the
-last estimate and tends to :math:`x^u`; estimates in which the fallback counts already change it less, since they say
-little. The age a of a gap is the number of samples that are missing so far; when measurements return it falls by a
+where m is zero for measurements, and one for all states while a measurement is missing: estimates that follow from
+substitutes do not enter what substitutes follow from, and F is stable as a whole. So the fallback :math:`x^u + o`
+continues the last estimate and tends to :math:`x^u`; estimates in which the fallback counts already change it less,
+since they say little. The age a of a gap is the number of samples that are missing so far; when measurements return it falls by a
 factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own :math:`\mu`: a state
 that is estimated from slow filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m is below
 one percent after five time constants of :math:`\mu`. The estimate of a state that is not measured is
@@ -106,8 +106,8 @@ class Gaps:
                 x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
             y = np.where(missing, expected, y)
         x[:, self.measured] = y
+        level[:, self.measured] = 0.0
         level[missing.any(axis=1)] = 1.0
-        level[:, self.measured] = missing
         offset += (1 - level) * (recorded - x[:, self.from_inputs] - offset)
         np.clip(offset, -self._most, self._most, out=offset)
 
@@ -122,6 +122,9 @@ class Gaps:
         recorded += disturbed**2 / (1 + disturbed**2) * (following[:, self.after_start] - recorded)
         np.clip(recorded, *self.limits, out=recorded)
         recorded += self.hidden * bank.level(age) * (fallback - recorded)
+        at, reach = self.measured, bank.reach[self.measured]
+        near = fallback[:, at] + np.clip(recorded[:, at] - fallback[:, at], -reach, reach)
+        recorded[:, at] = np.where(some[:, None], near, recorded[:, at])
         if some.any() or self.count.any():
             ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
             self.ramp[...] = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)

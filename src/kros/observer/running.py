@@ -121,7 +121,10 @@ class RunningObserver:
     def reset(self, y: ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         first = self._sample(y)
-        self._status, self._fresh = SampleStatus(int(first.status[0, 0])), bool(np.isfinite(first.y).any())
+        self._status, self._fresh = (
+            SampleStatus(int(first.status[0, 0])),
+            bool(self._screen.enough(np.isfinite(first.y)).all()),
+        )
         self._course.begin(first)
         if self._watch is not None:
             self._watch.reset()

@@ -13,7 +13,8 @@ The range is the largest size seen in training, or that of the declared limits; 
 nothing that is far from anything possible enters a state, linear or lifted, and what is left of a fault is what the
 model misses while it lasts.
 
-Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest,
+Observers start at a measurement, filter banks at all of them. Where none has arrived yet, or no value of some input,
+the estimate is that from rest,
 and the observer starts again at the first sample at which there are both. It does so, too, after an input was held for
 more than a few samples: what a held reference does to an observer that watches tracking errors grows with every sample,
 and a start costs no more than a start. Parameters stay.
@@ -122,13 +123,14 @@ class Screen:
     most: Array
     q: int
     longest: int = LONGEST
+    whole: bool = False  # whether an observer starts at all measurements only, as filter banks do
 
     @classmethod
     def of(cls, observer: ObserverData) -> Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
         sides = (side[list(observer.measured)] for side in observer.runtime.sides(observer.lifting.n_states))
         screen = cls.sized(observer.seen, len(observer.measured), len(observer.inputs), *sides)
-        return screen if observer.bank is None else replace(screen, longest=NEVER - 1)
+        return screen if observer.bank is None else replace(screen, longest=NEVER - 1, whole=True)
 
     @classmethod
     def sized(
@@ -144,6 +146,10 @@ class Screen:
         far = np.minimum(BEYOND * np.maximum(*sides), np.finfo(float).max)
         return cls(low, high, -far, far, q)
 
+    def enough(self, known: Flags) -> Flags:
+        """Return whether measurements that are known, (..., q), are enough to start at."""
+        return np.asarray(known.all(axis=-1) if self.whole else known.any(axis=-1))
+
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m); `held` is known before the first."""
         before, z, q = Held.nothing(*u.shape[1:]) if held is None else held, np.array([*y.T, *u.T]).T, self.q
@@ -158,7 +164,7 @@ class Screen:
         since = np.where(latest > 0, count - latest, count + before.since)
         inputs = np.take_along_axis(np.concatenate([before.inputs[None], within[..., q:]]), latest, axis=0)
         lost = np.asarray((since > self.longest).any(axis=-1))
-        complete = np.asarray(good.all(axis=-1) & plausible[..., :q].any(axis=-1))
+        complete = np.asarray(good.all(axis=-1) & self.enough(plausible[..., :q]))
         starts, stale = _starts(lost, complete, before.stale)
         y = np.where(plausible, within, np.nan)[..., :q]
         return Screened(y, inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))

@@ -90,9 +90,11 @@ def with_gaps(
     assert trial.bank is not None
     if hidden:
         states, y, inputs, own = training(trial, recordings, settings)
-        lost = losses(np.random.default_rng(settings.seed), *y.shape[:2])
+        rng = np.random.default_rng(settings.seed)
+        lost, some = losses(rng, *y.shape[:2]), rng.random(y.shape[1:]) < 0.5
+        some[np.arange(len(some)), rng.integers(y.shape[2], size=len(some))] = True  # of several sensors some are lost
         side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
-        shown = np.where(lost[..., None], np.nan, y)
+        shown = np.where(lost[..., None] & some, np.nan, y)
         filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
         longest = settings.blocks(recordings.length)[-1]
         ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))

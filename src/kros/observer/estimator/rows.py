@@ -184,29 +184,26 @@ class Design:
     def errors(self, rows: Array) -> list[tuple[float, float, Array]]:
         """Return by how much rows of `sample` may be wrong, with weights for all time and after a disturbance."""
         settings, bias, rng = self.settings, self.recordings.bias, np.random.default_rng(self.settings.seed)
-        biased, lost, restarts = list[Array](), list[Array](), list[Array]()
+        biased, bridged, restarts = list[Array](), list[Array](), list[Array]()
         for _, batch, at, _ in self.thinned(self.recordings.some(settings.sample_episodes), settings.sample):
             y = self.measurements(batch)
             v = self.signals(batch, y)
-            begin = int(rng.integers(0, len(v) // 2))
-            after = np.minimum(at, len(v) - begin - 2)
-            restarts.append(self.seen(v[begin:], after) - self.seen(v, begin + after))
+            restart = np.empty((len(at), len(self.bank)))
+            for part in range(settings.restarts):
+                begin = int(rng.integers(0, len(v) // 2))
+                after = np.minimum(at[part :: settings.restarts], len(v) - begin - 2)
+                restart[part :: settings.restarts] = self.seen(v[begin:], after) - self.seen(v, begin + after)
+            restarts.append(restart)
             if not self.channels.inputs_only:
-                lost.append(self.seen(self.half_lost(batch, y), at))
+                lost = np.random.default_rng(settings.seed).random(len(y)) < 0.5
+                line = interpolated(np.where(lost[:, None], np.nan, y))
+                bridged.append(self.seen(self.signals(batch, line), at))
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
                 biased.append(self.seen(self.signals(batch, y + bias), at))
         errors = [(0.0, 1.0, np.vstack(restarts))]
-        for share, again, wrong in ((settings.gap_share, settings.lost_share, lost), (1.0, 0.0, biased)):
-            errors += [(share, again, np.vstack(wrong) - rows)] if wrong else []
+        for share, wrong in ((settings.gap_share, bridged), (1.0, biased)):
+            errors += [(share, 0.0, np.vstack(wrong) - rows)] if wrong else []
         return errors
-
-    def half_lost(self, batch: EpisodeBatch, y: Array) -> Array:
-        """Return the channels where half of the samples is lost: straight lines, their functions of the last value."""
-        lost = np.random.default_rng(self.settings.seed).random(len(y)) < 0.5
-        lost[0] = False
-        v = self.signals(batch, y[np.maximum.accumulate(np.where(lost, 0, np.arange(len(y))))])
-        v[:, : y.shape[1]] = interpolated(np.where(lost[:, None], np.nan, y))
-        return v
 
     def measurements(self, batch: EpisodeBatch) -> Array:
         """Return the measurements of an episode, (n_samples, q), with straight lines over missing ones."""

@@ -65,13 +65,12 @@ class EstimatorSettings(Settings):
         "or a loss: rows with target zero, since machines start elsewhere than in recordings",
     )
     settled_share: float = Field(1e-5, gt=0, description="weight of these errors for all other time")
-    lost_share: float = Field(
-        0.1, ge=0, description="weight of the errors that half of the samples lost makes, beside those of such a start"
-    )
+    restarts: int = Field(8, ge=1, description="such starts of every episode")
     gap_share: float = Field(
         1e-3,
         ge=0,
-        description="weight of the same for all time, which bounds the gains of filters on smooth recordings",
+        description="weight of the errors that straight lines over lost measurements make, half of them: rows with "
+        "target zero, which bound the gains of filters on smooth recordings",
     )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"

@@ -10,10 +10,10 @@ internal states are the filters z of measurements and inputs, whose estimate is 
 where m is zero for measurements, and one for all states while a measurement is missing: estimates that follow from
 substitutes do not enter what substitutes follow from, and F is stable as a whole. So the fallback :math:`x^u + o`
 continues the last estimate and tends to :math:`x^u`; estimates in which the fallback counts already change it less,
-since they say little. The age a of a gap is the number of samples that are missing so far; when measurements return it falls by a
-factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own :math:`\mu`: a state
-that is estimated from slow filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m is below
-one percent after five time constants of :math:`\mu`. The estimate of a state that is not measured is
+since they say little. The age a of a gap is the number of samples that are missing so far; when measurements return it
+falls by a factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own :math:`\mu`:
+a state that is estimated from slow filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m
+is below one percent after five time constants of :math:`\mu`. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 

@@ -12,7 +12,7 @@ import pytest
 from kros.core.errors import ConfigError, DataError
 from kros.data import EpisodeKey
 from kros.data.discovery.discover import Wanted, discover
-from kros.data.measures import measure, unit_of_factor
+from kros.data.measures import measure, split_header, unit_of_factor
 from kros.data.readers.csv_folder import read_csv_folder
 
 SI = {
@@ -186,6 +186,11 @@ def test_every_stretch_above_a_trigger_is_an_episode(tmp_path: Path) -> None:
         read_csv_folder(tmp_path, MAPPING | {"trigger": "enable", "threshold": 9.0})
     with pytest.raises(DataError, match="column 'armed' is missing"):
         read_csv_folder(tmp_path, MAPPING | {"trigger": "armed"})
+
+
+@pytest.mark.parametrize(("header", "unit"), [("time_min", "min"), ("t_h", "h"), ("Zeit_min", "min"), ("x_min", "")])
+def test_a_column_of_time_may_be_in_minutes_or_hours(header, unit):
+    assert split_header(header)[1] == unit
 
 
 @pytest.mark.parametrize("text", ["pct", "pH", "Ah", "pu", "FS", "PS", "px", "S", "mS", "G", "NA", "ma"])

@@ -124,7 +124,8 @@ def split_header(text: str) -> tuple[str, str]:
     words = text.replace("_per_", "_").split("_")
     for count in range(min(2, len(words) - 1), 0, -1):  # rate_deg_s, then time_s
         stem, last = "_".join(words[:-count]), "/".join(words[-count:])
-        if stem and is_word(last) and (len(last) > 1 or last == "s") and last not in ("in", "no", "none", "min"):
+        clear = (len(last) > 1 or last == "s") and last not in ("in", "no", "none", "min")
+        if stem and is_word(last) and (clear or stem.lower() in ("t", "time", "zeit")):
             return stem, last
     split = after and is_word(after[2]) and (len(after[2]) > 1 or "/" in text or " in " in text)
     return (after[1].strip(), after[2]) if after and split else (text, "")

@@ -118,6 +118,10 @@ def test_errors_against_the_true_signal_stand_beside_those_against_the_recording
     (number,) = judge(Facts(facts)).numbers
     assert number.value == "0.0240"
     assert number.notes[-1] == "against the true signal: 0.310 %, 1.1 ms late"
+    observers = {NAME: {"left_out_to_training": {"velocity": 1.5}}}
+    (beside,) = judge(Facts(metrics(observers=observers, evaluation=facts["evaluation"]))).numbers
+    assert "in training 1.50 times as large on units left out" in beside.notes
+    assert not any("left out" in note for note in number.notes)
     first = errors(Facts(facts)).tables[0]
     assert "velocity: against the true signal (%)" in first.labels
     assert "velocity: against the true signal (%)" not in errors(Facts(metrics())).tables[0].labels

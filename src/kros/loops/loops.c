@@ -230,6 +230,11 @@ static int any(mask where)
     return some != 0;
 }
 
+static vec within(vec value, vec low, vec high)
+{
+    return either(value < low, low, either(value > high, high, value));
+}
+
 static vec level(vec age, vec half)
 {
     const vec ratio = age / half;
@@ -248,7 +253,7 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
             const vec seen = y[row], count = gap[recorded * MOST + row], held = from_inputs[i] + offset[i];
             const vec reach = (vec){0} + s->reach[s->measured[j]];
-            const vec apart = reg[i] - held, near = either(apart < -reach, -reach, either(apart > reach, reach, apart));
+            const vec near = within(reg[i] - held, -reach, reach);
             const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
             for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(recorded + s->q + 1 + j * r + l) * MOST + v] * jump;
@@ -303,15 +308,13 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
             const vec recovered = either(some, old, bank[recorded * MOST + at] * either(old > oldest, oldest, old));
             int hidden = 1;
             for (whole j = 0; j < q; j++) hidden &= s->measured[j] != i;
-            const vec low = (vec){0} + s->limits[i], high = (vec){0} + s->limits[recorded + i];
             next[at] += begun * (next[(n - 3 * recorded) * MOST + at] - next[at]);
-            next[at] = either(next[at] < low, low, either(next[at] > high, high, next[at]));
+            next[at] = within(next[at], (vec){0} + s->limits[i], (vec){0} + s->limits[recorded + i]);
             gap[at] = either(longest > recovered, longest, recovered);
             const vec fallback = next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at];
             const vec reach = (vec){0} + s->reach[i], apart = next[at] - fallback;
-            const vec near = fallback + either(apart < -reach, -reach, either(apart > reach, reach, apart));
             if (hidden) next[at] -= level(gap[at], half) * apart;
-            else next[at] = either(some, near, next[at]);
+            else next[at] = either(some, fallback + within(apart, -reach, reach), next[at]);
         }
     }
 }

@@ -54,10 +54,11 @@ class FilterBank:
         shares = dict.fromkeys(("recovery", "start_recovery"), "shares between 0 and 1")
         floats(self, "Filter bank", **shares, **kinds)
 
-    def level(self, age: Array) -> Array:
-        """Return m of every recorded state at ages, shape (..., n)."""
-        ratio = age / self.half
-        return ratio * ratio / (1 + ratio * ratio)
+
+def level(age: Array, half: Array | float = 1.0) -> Array:
+    """Return m at ages of which it is one half at `half`."""
+    ratio = age / half
+    return ratio * ratio / (1 + ratio * ratio)
 
 
 def longest_age(half: Array) -> Array:
@@ -95,7 +96,7 @@ class Gaps:
 
     def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
-        level, recorded, offset = self.bank.level(self.age), x[:, : self.recorded], x[:, self.offset]
+        share, recorded, offset = level(self.age, self.bank.half), x[:, : self.recorded], x[:, self.offset]
         if missing.any() or self.count.any():
             reach = self.bank.reach[self.measured]
             held = (x[:, self.from_inputs] + offset)[:, self.measured]
@@ -106,9 +107,9 @@ class Gaps:
                 x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
             y = np.where(missing, expected, y)
         x[:, self.measured] = y
-        level[:, self.measured] = 0.0
-        level[missing.any(axis=1)] = 1.0
-        offset += (1 - level) * (recorded - x[:, self.from_inputs] - offset)
+        share[:, self.measured] = 0.0
+        share[missing.any(axis=1)] = 1.0
+        offset += (1 - share) * (recorded - x[:, self.from_inputs] - offset)
         np.clip(offset, -self._most, self._most, out=offset)
 
     def follow(self, following: Array, missing: Flags) -> None:
@@ -119,9 +120,9 @@ class Gaps:
         age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
         disturbed = np.where(some[:, None], longest_age(np.ones(1)), self.start)
-        recorded += disturbed**2 / (1 + disturbed**2) * (following[:, self.after_start] - recorded)
+        recorded += level(disturbed) * (following[:, self.after_start] - recorded)
         np.clip(recorded, *self.limits, out=recorded)
-        recorded += self.hidden * bank.level(age) * (fallback - recorded)
+        recorded += self.hidden * level(age, bank.half) * (fallback - recorded)
         at, reach = self.measured, bank.reach[self.measured]
         near = fallback[:, at] + np.clip(recorded[:, at] - fallback[:, at], -reach, reach)
         recorded[:, at] = np.where(some[:, None], near, recorded[:, at])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import TINY, Array, Flags, Parameters
-from ..filter_bank import FilterBank, longest_age
+from ..filter_bank import FilterBank, level, longest_age
 from ..observer import Observer
 from ..simulate import Course
 from .rows import Recordings
@@ -137,18 +137,14 @@ def blended_errors(
     """Return mean squared errors (c, batch, judged) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
     count, age, fading = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1])), np.zeros(len(F), bool)
     fading[judged] = True
-    x, level, squares = (
-        np.repeat(filtered[:1], len(half), axis=0),
-        np.zeros((*age.shape, 1)),
-        np.zeros_like(filtered[:1]),
-    )
-    offset = x - from_inputs[0]
+    x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros_like(filtered[:1])
+    offset, blend = x - from_inputs[0], np.zeros((*age.shape, 1))
     for k, lost in enumerate(missing[:-1]):
-        share = np.where(lost[:, None], 1.0, fading * level)
+        share = np.where(lost[:, None], 1.0, fading * blend)
         offset = (offset + (1 - share) * (x - from_inputs[k] - offset)) @ F.T
         count = np.where(lost, count + 1, 0.0)
         age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)
-        level = (age**2 / (age**2 + half**2))[..., None]
-        x = filtered[k + 1] + fading * level * (from_inputs[k + 1] + offset - filtered[k + 1])
+        blend = level(age, half)[..., None]
+        x = filtered[k + 1] + fading * blend * (from_inputs[k + 1] + offset - filtered[k + 1])
         squares = squares + (x - states[k + 1]) ** 2
     return squares[..., judged] / len(missing)

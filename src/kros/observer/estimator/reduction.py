@@ -104,7 +104,7 @@ def reduced(
     whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
     if order is not None:
         return whole.first(order).modal()
-    signals = design.filtered(_EPISODES, round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
+    signals = design.sample_signals(_EPISODES, round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
     every, most = np.arange(len(signals)), 2 * design.settings.loss
     wanted = np.stack([design.bank.rows(v, every) @ coefficients for v in signals.swapaxes(0, 1)], axis=1)
 

@@ -153,7 +153,7 @@ class Design:
         """Return the design with the bank of its channels, and of poles of the machines."""
         return cls(channels, Bank.of(channels, recordings.length, settings, poles), recordings, settings)
 
-    def thinned(self, recordings: Recordings, rows: int) -> Iterator[tuple[EpisodeKey, EpisodeBatch, Whole, Array]]:
+    def episodes(self, recordings: Recordings, rows: int) -> Iterator[tuple[EpisodeKey, EpisodeBatch, Whole, Array]]:
         """Yield every episode with the samples that are rows, and their weights."""
         first = round(self.settings.start_rows * max(self.settings.start, default=0.0))
         for key, (at, weights) in zip(recordings.keys, thinned(recordings.lengths, rows, first), strict=True):
@@ -165,7 +165,7 @@ class Design:
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
         """
         measured = list(self.channels.measured)
-        for key, batch, at, weights in self.thinned(recordings, rows):
+        for key, batch, at, weights in self.episodes(recordings, rows):
             y = self.measurements(batch)
             v = self.signals(batch, y)
             targets = batch.states[at + 1, 0] / recordings.size
@@ -185,15 +185,15 @@ class Design:
         """Return by how much rows of `sample` may be wrong, with weights for all time and after a disturbance."""
         settings, bias, rng = self.settings, self.recordings.bias, np.random.default_rng(self.settings.seed)
         biased, bridged, restarts = list[Array](), list[Array](), list[Array]()
-        for _, batch, at, _ in self.thinned(self.recordings.some(settings.sample_episodes), settings.sample):
+        for _, batch, at, _ in self.episodes(self.recordings.some(settings.sample_episodes), settings.sample):
             y = self.measurements(batch)
             v = self.signals(batch, y)
-            restart = np.empty((len(at), len(self.bank)))
-            for part in range(settings.restarts):
+            started, places = np.empty((len(at), len(self.bank))), at.copy()
+            for part in (slice(i, None, settings.restarts) for i in range(settings.restarts)):
                 begin = int(rng.integers(0, len(v) // 2))
-                after = np.minimum(at[part :: settings.restarts], len(v) - begin - 2)
-                restart[part :: settings.restarts] = self.seen(v[begin:], after) - self.seen(v, begin + after)
-            restarts.append(restart)
+                after = np.minimum(at[part], len(v) - begin - 2)
+                started[part], places[part] = self.seen(v[begin:], after), begin + after
+            restarts.append(started - self.seen(v, places))
             if not self.channels.inputs_only:
                 lost = np.random.default_rng(settings.seed).random(len(y)) < 0.5
                 line = interpolated(np.where(lost[:, None], np.nan, y))
@@ -218,7 +218,7 @@ class Design:
         """Return what the bank holds at samples of channels v, shape (len(at), len(self.bank))."""
         return self.bank.rows(self.channels.filtered(v), at)
 
-    def filtered(self, some: int, length: int) -> Array:
+    def sample_signals(self, some: int, length: int) -> Array:
         """Return what filters see in some episodes, cut to one length, shape (n_samples, batch, channels)."""
         recordings = self.recordings.some(some)
         shortest = min(length, *recordings.lengths)

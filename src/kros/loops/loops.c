@@ -230,7 +230,7 @@ static int any(mask where)
     return some != 0;
 }
 
-static vec within(vec value, vec low, vec high)
+static vec clipped(vec value, vec low, vec high)
 {
     return either(value < low, low, either(value > high, high, value));
 }
@@ -253,7 +253,7 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
             const vec seen = y[row], count = gap[recorded * MOST + row], held = from_inputs[i] + offset[i];
             const vec reach = (vec){0} + s->reach[s->measured[j]];
-            const vec near = within(reg[i] - held, -reach, reach);
+            const vec near = clipped(reg[i] - held, -reach, reach);
             const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
             for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(recorded + s->q + 1 + j * r + l) * MOST + v] * jump;
@@ -272,7 +272,7 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
             const vec share = either(lost, (vec){0}, 1.0 - hidden * level(gap[at], bank[at]));
             const vec moved = offset[at] + share * (reg[at] - from_inputs[at] - offset[at]);
             const double most = hidden ? s->reach[i] : INFINITY;
-            offset[at] = either(moved > most, (vec){0} + most, either(moved < -most, (vec){0} - most, moved));
+            offset[at] = clipped(moved, (vec){0} - most, (vec){0} + most);
         }
 }
 
@@ -309,12 +309,12 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
             int hidden = 1;
             for (whole j = 0; j < q; j++) hidden &= s->measured[j] != i;
             next[at] += begun * (next[(n - 3 * recorded) * MOST + at] - next[at]);
-            next[at] = within(next[at], (vec){0} + s->limits[i], (vec){0} + s->limits[recorded + i]);
+            next[at] = clipped(next[at], (vec){0} + s->limits[i], (vec){0} + s->limits[recorded + i]);
             gap[at] = either(longest > recovered, longest, recovered);
             const vec fallback = next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at];
             const vec reach = (vec){0} + s->reach[i], apart = next[at] - fallback;
             if (hidden) next[at] -= level(gap[at], half) * apart;
-            else next[at] = either(some, fallback + within(apart, -reach, reach), next[at]);
+            else next[at] = either(some, fallback + clipped(apart, -reach, reach), next[at]);
         }
     }
 }

@@ -279,16 +279,24 @@ def test_time_is_converted_file_by_file_as_other_columns_are(tmp_path: Path) -> 
     plain = samples(0)
     for name, unit, factor in (("a/cold_1.csv", "s", 1.0), ("a/cold_2.csv", "ms", 1e3)):
         write(tmp_path / name, (plain + np.array([0, factor, 0])) * [factor, 1, 1], f"t,pos,volt\n{unit},mm,V")
-    one = read_csv_folder(tmp_path, mapping(time_unit="s", unit_rows=1))
+    one = read_csv_folder(tmp_path, mapping(unit_rows=1))
     assert one.sample_period_s == 0.01
     assert [len(one.read(key)) for key in one.episodes] == [N, N]
     with pytest.raises(DataError, match=r"cold_2\.csv: column 't' is in 'ms', and in another file in 's'"):
-        read_csv_folder(tmp_path, mapping(unit_rows=1))
+        read_csv_folder(tmp_path, mapping(time_scale=1.0, unit_rows=1))
     for name, unit in (("a/cold_1.csv", "seconds"), ("a/cold_2.csv", "s")):  # one unit, in two spellings
         write(tmp_path / name, plain + np.array([0, len(unit), 0]), f"t,pos,volt\n{unit},counts,V")
     assert read_csv_folder(tmp_path, mapping(unit_rows=1)).sample_period_s == 0.01
-    with pytest.raises(DataError, match=r"column 't' is in 's.*', and declared in 'rad'"):
-        read_csv_folder(tmp_path, mapping(time_unit="rad", unit_rows=1))
+    assert read_csv_folder(tmp_path, mapping(time_scale=1e-3, unit_rows=1)).sample_period_s == 1e-5
+    write(tmp_path / "a/cold_1.csv", plain, "t,pos,volt\nrad,counts,V")
+    with pytest.raises(DataError, match=r"column 't' is in 'rad', and declared in 's'"):
+        read_csv_folder(tmp_path, mapping(unit_rows=1))
+
+
+def test_milliseconds_since_1970_with_their_unit_lose_nothing(tmp_path: Path) -> None:
+    rows = [f"{1716000000000 + 2 * k},{k},{k * k}" for k in range(9)]
+    (tmp_path / "a.csv").write_text("\n".join(["t [ms],pos,volt", *rows]))
+    assert read_csv_folder(tmp_path, mapping(files="a")).sample_period_s == 0.002
 
 
 def test_a_damaged_first_file_gives_no_period_and_spoils_no_other(folder: Path) -> None:

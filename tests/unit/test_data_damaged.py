@@ -18,7 +18,6 @@ from kros.core import limits
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, prepare, read, steps, write_parquet
 from kros.data.readers.parquet import read_parquet
-from kros.identify.survey import period_alerts
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 MAPPING: dict[str, Any] = {
@@ -243,12 +242,6 @@ def test_copies_are_refused_and_named(tmp_path: Path, copied: Any) -> None:
     with pytest.raises(DataError, match=r"[Ee]pisode \d of unit \w .* episode 1 of unit a \(c\)"):
         write_parquet(population, tmp_path / "p")
     assert not (tmp_path / "p").exists()
-
-
-@pytest.mark.parametrize("period", [1.0, 0.5, 60.0, 1e-6])
-def test_unusual_periods_are_said(period: float) -> None:
-    assert "unusual" in period_alerts(period)[0]
-    assert period_alerts(0.01) == ()
 
 
 def test_lines_before_the_header_are_counted_alike_whatever_they_hold(tmp_path: Path) -> None:

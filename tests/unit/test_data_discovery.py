@@ -13,7 +13,7 @@ from kros.core.errors import DataError
 from kros.data.discovery.dialect import look_at
 from kros.data.discovery.discover import Wanted, discover
 from kros.data.discovery.filenames import infer_names
-from kros.data.discovery.roles import TableColumn, identifier, kind_of, time_scale
+from kros.data.discovery.roles import identifier, kind_of, time_scale
 from kros.data.measures import split_header
 
 UNITS, EPISODES = range(1, 4), range(1, 4)
@@ -167,9 +167,8 @@ def test_names_of_channels_may_stand_in_formulas():
     assert kind_of("x", "bar") == "pressure"
 
 
-def test_scale_of_time():
-    assert time_scale(TableColumn("t [ms]", "t", "s", 1e-3), 1.0)[0] == 1e-3
-    assert [time_scale(TableColumn("t", "t"), step)[0] for step in (0.001, 1.0, 2000.0, 1e6)] == [1.0, 1e-3, 1e-6, 1e-9]
+def test_scale_of_time_without_a_unit():
+    assert [time_scale(step)[0] for step in (0.001, 0.9, 1.0, 2000.0, 1e6)] == [1.0, 1.0, 1e-3, 1e-6, 1e-9]
 
 
 def test_lines_before_the_numbers(tmp_path: Path):

@@ -141,9 +141,11 @@ def test_init_writes_conversions_to_si(tmp_path: Path) -> None:
         "column_unit": "degC",
         "role": "",
         "measured": True,
-        "unit": "K",
-        "offset": 273.15,
+        "unit": "degC",
     }
+    assert found.mapping["time"] == "time [ms]"
+    assert "time_scale" not in found.mapping
+    assert found.population.sample_period_s == pytest.approx(0.01)
     assert channels["valve_cmd"]["unit"] == "%"
     assert len(found.population.episodes) == 4
     speeds = [found.population.read(key)[:, 0] for key in found.population.episodes[:2]]
@@ -152,6 +154,20 @@ def test_init_writes_conversions_to_si(tmp_path: Path) -> None:
     assert declared in ("rpm", "rad/s")
     np.testing.assert_allclose(speeds[0], raw[0] * math.pi / 30, rtol=1e-9)
     np.testing.assert_allclose(speeds[1], raw[1], rtol=1e-9)
+
+
+def test_a_temperature_stays_in_degc_and_k(tmp_path: Path) -> None:
+    measured = {"K": (1.0, 273.15), "degC": (1.0, 0.0), "degF": (1.8, 32.0)}
+    for unit, (factor, zero) in measured.items():
+        folder = tmp_path / unit
+        folder.mkdir()
+        for k in range(4):
+            temperature, current = signals(k)
+            write(folder / f"m{k // 2}_{k}.csv", f"t [s],T [{unit}],i_cmd [A]", factor * temperature + zero, current)
+        found = discover(folder, Wanted(measured=("T",))).population
+        added = 273.15 if unit == "K" else 0.0
+        assert found.channels[0].unit == ("K" if unit == "K" else "degC")
+        np.testing.assert_allclose(found.read(found.episodes[0])[:, 0], signals(0)[0] + added, rtol=1e-12)
 
 
 # ------------------------------------------------------------------------------------- several episodes in one file

@@ -44,6 +44,7 @@ def _pairs(table: str) -> dict[str, str]:
 
 
 KINDS = _pairs(_SI)
+ZERO_OF_CELSIUS = 273.15  # K
 _PINT = _pairs(_SPELLED)
 _KNOWN = set(re.findall(r"[^\W\d_]+", _SI + _SPELLED + _WORDS + _MORE)) - {"pct", "F", "none", "bool", "hex", "dez"}
 

@@ -24,7 +24,7 @@ from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 @frozen
 class CheckRule:
-    """What recordings are refused for, and which sampling periods are doubted."""
+    """What recordings are refused for, and what is doubted."""
 
     time: float = 1e-3  # largest deviation of one time step, in sampling periods
     period: float = 1e-4  # largest relative difference of the sampling periods of two episodes
@@ -37,9 +37,6 @@ class CheckRule:
     held: float = 0.2  # share of an episode in which a state stays the same, from which on its sensor is doubted
     jump: float = 2.0  # change of a state between two samples, in ranges of most of them, beyond which it is doubted
     constant: float = ROUNDING  # of the largest value: what filters and scales make of a constant
-    # sampling periods outside are usual for a time in ms or us that is taken for seconds
-    shortest_s: float = 1e-6
-    longest_s: float = 0.5
 
 
 CHECK = CheckRule()

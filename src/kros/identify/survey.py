@@ -21,16 +21,8 @@ from ..core.files import is_file, link_or_copy
 from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, scaling_of, split_episodes
 from ..data.prepare import recording_marks
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
-from ..data.recording import CHECK, check_population, refuse_copies, some, title, usable, usable_episodes
+from ..data.recording import check_population, refuse_copies, some, title, usable, usable_episodes
 from .likeness import course, moments, odd, unlike
-
-
-def period_alerts(period_s: float) -> tuple[str, ...]:
-    """Return what speaks against a sampling period: a time in ms or us that is taken for seconds."""
-    unusual = f"The sampling period of {period_s:g} s is unusual: check the unit of the column of time (time_scale)"
-    alert = f"{unusual} and sample_period_s, on which every frequency depends."
-    return () if CHECK.shortest_s < period_s < CHECK.longest_s else (alert,)
-
 
 log = logging.getLogger(__name__)
 UNLOADED = "noload"
@@ -191,7 +183,7 @@ def _facts(
         test=test,
         resolution={m: _median([g.resolution[m] for g in read]) for m in retained.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
-        alerts=(*period_alerts(retained.sample_period_s), *_unlike(retained, read, groups), *strange),
+        alerts=(*_unlike(retained, read, groups), *strange),
         reserve=tuple(options.reserve),
         digests=tuple(digests[key] for key in train + test),
     )

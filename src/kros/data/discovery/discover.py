@@ -175,9 +175,11 @@ def _time(
     texts = [c for c, order in stamps.items() if order is not None]
     if candidates and (not texts or candidates[0].kind == "time"):
         time = candidates[0]
-        scale, why = time_scale(time, float(np.median(np.diff(samples[time.at][0]))))
-        keys: Record = {"time": time.reference} | ({"time_unit": time.recorded} if time.recorded else {})
-        return (time, keys, {}) if scale == 1 else (time, keys | {"time_scale": scale}, {"time_scale": why})
+        keys: Record = {"time": time.reference}
+        if time.unit == "s":
+            return time, keys, {}
+        scale, why = time_scale(float(np.median(np.diff(samples[time.at][0]))))
+        return time, keys | {"time_scale": scale}, {"time_scale": why}
     if texts:
         return texts[-1], {"time": texts[-1].reference, "timestamp": stamps[texts[-1]]}, {}
     called = next((c.header for c in columns if c.kind == "time"), None)

@@ -11,9 +11,8 @@ from enum import Enum
 import numpy as np
 
 from ...core import Array, frozen
-from ..measures import KINDS, Measure, clean_unit, measure, split_header
+from ..measures import KINDS, ZERO_OF_CELSIUS, Measure, clean_unit, measure, split_header
 from ..readers.tables import Table, stretches
-from ..recording import CHECK
 
 WORDS = {
     "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl ref reference "
@@ -106,6 +105,8 @@ def describe(table: Table) -> list[TableColumn]:
         name = header if header.isidentifier() and not written else stem
         name = identifier(f"column_{name}" if name.isdigit() else name, [c.name for c in columns])
         known = measure(unit) or Measure(unit, 1.0, 0.0)
+        if known.offset:  # a temperature whose zero is not that of K
+            known = Measure("degC", known.factor, known.offset - ZERO_OF_CELSIUS)
         about = known.si, known.factor, known.offset, unit, kind_of(stem, unit)
         alone = table.dialect.header and table.fields.count(header) == 1
         columns.append(TableColumn(header, name, *about, at=i, alone=alone))
@@ -149,14 +150,11 @@ def _counts(column: Array) -> bool:
     return bool((np.diff(column) == 1).all())
 
 
-def time_scale(column: TableColumn, step: float) -> tuple[float, str]:
-    """Return the factor from a column of time to seconds by its unit, else the size of its steps, and the reason."""
-    if column.unit == "s":
-        return column.scale, f"its unit of measure is {column.recorded}"
-    for name, size in {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.items():
-        if CHECK.shortest_s < size * step < CHECK.longest_s:
-            return size, f"a step of {step:g} looks like {name}: correct time_scale if it is not"
-    return 1.0, f"a step of {step:g} fits no unit of time: correct time_scale"
+def time_scale(step: float) -> tuple[float, str]:
+    """Return the factor from a column of time without a unit to seconds, for steps below one, and the reason."""
+    sizes = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+    name = next((name for name, size in sizes.items() if size * step < 1), "ns")
+    return sizes[name], f"no unit is stated, and a step of {step:g} looks like {name}: correct it if it is not"
 
 
 def propose(columns: Sequence[TableColumn], samples: Samples) -> list[TableColumn]:

@@ -60,9 +60,8 @@ class CsvMapping(Dialect):
     )
     channel: tuple[ChannelMapping, ...] = Field(description="the channels, in any order")
     time: Column | None = Field(None, description="column of time")
-    time_unit: str = Field("", description="of the column of time, as `column_unit` of a channel")
     unit: tuple[UnitMapping, ...] = Field((), description="where one file holds several units")
-    time_scale: float = Field(1.0, gt=0, description="factor from the column of time to seconds")
+    time_scale: float | None = Field(None, gt=0, description="of time, to seconds; default: by its unit in the file")
     sample_period_s: float | None = Field(None, gt=0, description="in place of a column of time")
     exclude: str | None = Field(
         None,
@@ -205,7 +204,7 @@ class FilePlace:
 
     table: Table
     wanted: Columns
-    factors: tuple[float, ...]  # to the declared units of measure of those wanted
+    factors: tuple[float, ...]  # to the declared units of measure of those wanted; of time, seconds by default
     offsets: tuple[float, ...]
     rows: slice
     piece: tuple[int, int]  # of how many
@@ -234,21 +233,21 @@ class CsvRecordings(Recordings):
         yield waiting[0].ended()
 
     def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
-        """Yield the columns of a file in blocks, in the units of measure that are declared."""
+        """Yield the columns of a file in blocks."""
         (i, n), whole = place.piece, (place.piece, place.rows) == ((0, 1), slice(None))
         for values in place.table.numbers(place.wanted, self.timestamp, rows if whole else np.inf):
             values = values[place.rows]
-            values = values[i * len(values) // n : (i + 1) * len(values) // n]
-            yield values * place.factors + place.offsets
+            yield values[i * len(values) // n : (i + 1) * len(values) // n]
 
     def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
-        """Return samples with their time, the first column if there is one, since the `first` of an episode."""
+        """Return samples in declared units, with time, the first column if there is one, since the `first` sample."""
+        factors, offsets = self.places[key].factors, self.places[key].offsets
         if self.time_scale is None:
-            return Recording(key, np.ascontiguousarray(values))
-        scale = self.time_scale if self.timestamp is None else TIMESTAMP_SCALE
+            return Recording(key, values * factors + offsets)
+        scale = factors[0] * (self.time_scale if self.timestamp is None else TIMESTAMP_SCALE)
         time, start = (np.where(usable(t), t, np.nan) for t in (values[:, 0], first[:, 0]))
         since = time - start  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
-        return Recording(key, np.ascontiguousarray(values[:, 1:]), since * scale)
+        return Recording(key, values[:, 1:] * factors[1:] + offsets[1:], since * scale)
 
 
 def read_csv_folder(
@@ -286,7 +285,7 @@ def read_csv_folder(
                 raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
     if not places:
         raise _nothing(source, chosen)
-    time_scale = None if chosen.time is None else chosen.time_scale
+    time_scale = None if chosen.time is None else chosen.time_scale or 1.0
     recordings = CsvRecordings(places, time_scale, chosen.timestamp)
     channels = tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in chosen.ordered)
     facts = ([Unit(unit, group) for unit, group in groups.items()], chosen.sample_period_s, chosen.metadata)
@@ -382,7 +381,8 @@ def _places(
     table: Table, mapping: CsvMapping, unit: UnitMapping, known: dict[Column, str]
 ) -> tuple[Columns, tuple[float, ...], tuple[float, ...]]:
     """Return where the channels of a unit are in a file, with factors and offsets to their units of measure."""
-    wanted = [] if mapping.time is None else [(mapping.time, mapping.time_unit)]
+    scaled = mapping.time_scale is not None or mapping.timestamp is not None
+    wanted = [] if mapping.time is None else [(mapping.time, "" if scaled else "s")]
     wanted += [(mapping.column(channel, unit), channel.column_unit) for channel in mapping.ordered]
     numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for (c, _), f in zip(wanted, table.fields, strict=False))
     if mapping.header and numbered:
@@ -390,7 +390,6 @@ def _places(
         raise DataError(f"Reading {table.path}: {problem}; put the names of the columns first, or set header = false.")
     at = tuple(_position(table, *column) for column in wanted)
     pairs = [_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True)]
-    pairs[:1] = pairs[:1] if mapping.timestamp is None else [(1.0, 0.0)]
     return at, tuple(factor for factor, _ in pairs), tuple(offset for _, offset in pairs)
 
 
@@ -407,7 +406,7 @@ def _conversion(table: Table, at: int, column: Column, declared: str, known: dic
         problem = (
             f"column {column!r} is in {stated!r}, and {'declared' if declared else 'in another file'} in {usual!r}"
         )
-        raise DataError(f"Reading {table.path}: {problem}; correct the file, or column_unit (time_unit).")
+        raise DataError(f"Reading {table.path}: {problem}; correct the file, or column_unit (time_scale).")
     return theirs.factor / ours.factor, (theirs.offset - ours.offset) / ours.factor
 
 

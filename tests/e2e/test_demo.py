@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from kros.core import DataError
 from kros.identify import ModelSet
 from kros.observer import Observer, run_observer
 from kros.observer.sensor_gains import sensor_gains
@@ -158,6 +159,20 @@ def test_the_deployed_observer_is_exported(kros, demo, tmp_path, command):
     assert out.exists()
     assert kros("export", command, demo, tmp_path / "other.fmu", "--observer", "nobody").exit_code == 2
     assert not (tmp_path / "other.fmu").exists()
+
+
+@pytest.mark.parametrize(("command", "precision"), [("c", "float"), ("c", "double"), ("fmu", "float")])
+def test_single_precision_that_was_not_compared_is_a_warning(
+    kros, demo, tmp_path, monkeypatch, caplog, command, precision
+):
+    def gone(_):
+        raise DataError("there are no recordings")
+
+    monkeypatch.setattr("kros.study.commands.export.open_source", gone)
+    result = kros("export", command, demo, tmp_path / "out.fmu", "--precision", precision)
+    assert result.exit_code == 0, result.output
+    assert ("there are no recordings" in caplog.text) == (command == "c")
+    assert ("single precision was not compared" in caplog.text) == (precision == "float")
 
 
 def test_new_units_are_scored(kros, demo, recorded, tmp_path):

@@ -179,6 +179,33 @@ def test_a_run_ends_with_a_verdict_numbers_and_a_path(tmp_path: Path) -> None:
     assert alert == "check: stuck"
 
 
+def test_the_head_names_every_hidden_state_and_its_worst_condition(tmp_path: Path) -> None:
+    """Three states in two conditions: the largest error is that of the last state in the other condition."""
+    means = {"velocity": (0.2, 0.1), "current": (6.2, 7.0), "force": (8.0, 45.0)}
+    rows = [
+        row(NAME, percent, channel=channel) | {"condition": condition}
+        for channel, of in means.items()
+        for condition, percent in zip(("default", "cold"), of, strict=True)
+    ]
+    rows += [row("koopman/open_loop", 90.0, channel=channel) for channel in means]
+    conditions = {"study": {"conditions": ["default", "cold"]}}
+    _, velocity, current, force, _ = lines_of(RunResult(tmp_path, metrics(evaluation=rows, **conditions)))
+    assert "cold" not in velocity
+    assert current.endswith("(worst unit b: 6.20 %; cold: 7.00 %)")
+    assert force == "error of force: 8.00 % of the largest value (worst unit b: 8.00 %; cold: 45.0 %)"
+    rows.append(row(NAME, None, unit="c", channel="velocity") | {"condition": "cold"})
+    assert "cold: diverged" in lines_of(RunResult(tmp_path, metrics(evaluation=rows, **conditions)))[1]
+
+
+def test_a_channel_without_a_unit_has_numbers_alone() -> None:
+    entry = {"set_certified": True, "set_bound": {"force": 0.003}}
+    rows = [row(NAME, 0.2, channel="force"), row("koopman/open_loop", 0.9, channel="force")]
+    verdict = judge(Facts(metrics(observers={NAME: entry}, evaluation=rows)))
+    assert verdict.reasons[0].text.endswith("force of unit b has 0.00400, expected were 0.00300.")
+    assert "is at most 0.00300 in force;" in verdict.certified[0]
+    assert verdict.numbers[0].notes[0] == "RMS 0.00400"
+
+
 def lines_of(result: RunResult) -> list[str]:
     """Return the lines of a summary, each with a colon in place of the space between name and text."""
     return [re.sub("  +", ": ", line) for line in result.summary().splitlines()[1:]]

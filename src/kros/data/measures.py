@@ -112,8 +112,11 @@ def _measured(text: str) -> Measure | None:
 
 def unit_of_factor(factor: float, unit: str) -> str:
     """Return the unit of measure with the zero of an SI unit that is so many of it; nothing where none is known."""
-    sizes = ((name, m) for name in _WORDS.split() if (m := measure(name)) is not None and (m.si, m.offset) == (unit, 0))
-    return next((name for name, m in sizes if math.isclose(m.factor, factor, rel_tol=AGREED)), "")
+    for name in _WORDS.split():
+        m = measure(name)
+        if m is not None and (m.si, m.offset) == (unit, 0) and math.isclose(m.factor, factor, rel_tol=AGREED):
+            return name
+    return ""
 
 
 def split_header(text: str) -> tuple[str, str]:

@@ -17,7 +17,7 @@ from ..core import ByName, Names, frozen
 from ..core.arrays import T
 from ..data import OUTLIERS, natural_key
 from ..design.task import split_name
-from .names import observer_label, readable_unit, words
+from .names import number, observer_label, readable_unit, words
 
 K = TypeVar("K")
 Rows = Sequence[ByName]
@@ -175,6 +175,10 @@ class Facts:
     def unit(self, channel: str) -> str:
         """Return the unit of measure of a channel; nothing where there is none."""
         return readable_unit(self.study.get("channels", {}).get(channel, ""))
+
+    def quantity(self, channel: str, value: float | None) -> str:
+        """Return a value of a channel with its unit of measure, if it has one."""
+        return f"{number(value)} {self.unit(channel)}".strip()
 
     def axis(self, channel: str) -> str:
         """Return a channel's name with its unit of measure."""

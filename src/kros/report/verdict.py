@@ -94,19 +94,20 @@ def _sentence(facts: Facts, status: Status, reasons: Sequence[Reason]) -> str:
 
 def channels(names: Sequence[str]) -> str:
     """Return channels for a sentence."""
-    return joined([words(name) for name in names])
+    return joined(list(map(words, names)))
 
 
 def _numbers(facts: Facts) -> list[Number]:
-    """Return the errors of at most two hidden channels, and how many units are flagged."""
+    """Return the errors of the hidden channels, and how many units are flagged."""
     numbers = []
-    for channel in facts.hidden[:2]:
-        cell, known = facts.cells[channel], facts.cells[channel].means
+    for channel in facts.hidden:
+        cell = facts.cells[channel]
+        known = cell.means
         if cell.mean is not None:
-            notes = [f"RMS {number(known['rms'])} {facts.unit(channel)}".strip()] if known.get("rms") else []
+            notes = [f"RMS {facts.quantity(channel, known['rms'])}"] if known.get("rms") else []
             if growth := facts.entry.get("left_out_to_training", {}).get(channel):
                 notes.append(f"in training {growth:.2f} times as large on units left out")
-            notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
+            notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %", *_elsewhere(facts, channel)]
             if error := known.get("true_error_percent"):
                 notes.append(f"against the true signal: {number(error)} %{_lag(known.get('true_lag_s'))}")
             numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
@@ -115,6 +116,14 @@ def _numbers(facts: Facts) -> list[Number]:
         notes = [some(flagged) or "none", *([f"UNDECIDED: {len(open_)} of {len(rows)} scores"] if open_ else [])]
         numbers.append(Number(str(len(flagged)), f"of {len({r['unit'] for r in rows})}", "units flagged", notes))
     return numbers
+
+
+def _elsewhere(facts: Facts, channel: str) -> list[str]:
+    """Return the mean error in the worst condition, if this is not that of the models."""
+    cells = {t.condition: t.cells.get(facts.deployed, {}).get(channel, ErrorCell()) for t in facts.tables}
+    worst, cell = max(cells.items(), key=lambda item: (item[1].diverged, item[1].mean or 0.0))
+    error = "diverged" if cell.diverged else f"{number(cell.mean)} %"
+    return [] if worst == facts.table.condition else [f"{condition_label(worst) or worst}: {error}"]
 
 
 def _lag(lag_s: float | None) -> str:
@@ -201,15 +210,15 @@ def _of_errors(facts: Facts) -> Checks:
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."
         yield text, "Do not rely on the estimate more than on the model.", "errors"
-    errors = {c: facts.cells[c].mean or 0.0 for c in hidden}
-    if large := {c: error for c, error in errors.items() if error > 100 * THRESHOLDS.large}:
+    if large := {c: e for c in hidden if (e := facts.cells[c].mean or 0.0) > 100 * THRESHOLDS.large}:
         each = joined([f"{words(c)} ({number(e)} % of the largest value)" for c, e in large.items()])
         yield f"The error is large: {each}.", "Measure another signal, or use the estimate for trends alone.", "errors"
     for channel, bound in (facts.entry.get("set_bound") or {}).items():
-        cell, unit = facts.cells.get(channel, ErrorCell()), facts.unit(channel)
+        cell = facts.cells.get(channel, ErrorCell())
         if cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
             text = f"A held-out episode exceeds the largest RMS error expected: {words(channel)} of unit "
-            text += f"{cell.worst_unit} has {number(cell.worst_rms)} {unit}, expected were {number(bound)} {unit}."
+            expected = facts.quantity(channel, bound)
+            text += f"{cell.worst_unit} has {facts.quantity(channel, cell.worst_rms)}, expected were {expected}."
             yield text, "Do not rely on this number; record more kinds of episodes.", "certificates"
 
 
@@ -252,7 +261,7 @@ def certificates(facts: Facts) -> list[str]:
     bounds = {c: b for c, b in (entry.get("set_bound") or {}).items() if b is not None and entry.get("set_certified")}
     hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
     if hidden:
-        parts = [" ".join(filter(None, (number(bounds[c]), facts.unit(c), "in", words(c)))) for c in hidden]
+        parts = [f"{facts.quantity(c, bounds[c])} in {words(c)}" for c in hidden]
         bank = split_name(facts.deployed)[1] == "estimator"
         source = "Measured on units left out of its regression" if bank else "For recorded signals"
         share = f"; about one new unit in {facts.study['units'] + 1} exceeds it" if bank else ""

@@ -204,8 +204,7 @@ class FilePlace:
 
     table: Table
     wanted: Columns
-    factors: tuple[float, ...]  # to the declared units of measure of those wanted; of time, seconds by default
-    offsets: tuple[float, ...]
+    scales: tuple[tuple[float, float], ...]  # factors and offsets to their declared units of measure
     rows: slice
     piece: tuple[int, int]  # of how many
 
@@ -241,7 +240,7 @@ class CsvRecordings(Recordings):
 
     def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
         """Return samples in declared units, with time, the first column if there is one, since the `first` sample."""
-        factors, offsets = self.places[key].factors, self.places[key].offsets
+        factors, offsets = np.transpose(self.places[key].scales)
         if self.time_scale is None:
             return Recording(key, values * factors + offsets)
         scale = factors[0] * (self.time_scale if self.timestamp is None else TIMESTAMP_SCALE)
@@ -379,7 +378,7 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
 
 def _places(
     table: Table, mapping: CsvMapping, unit: UnitMapping, known: dict[Column, str]
-) -> tuple[Columns, tuple[float, ...], tuple[float, ...]]:
+) -> tuple[Columns, tuple[tuple[float, float], ...]]:
     """Return where the channels of a unit are in a file, with factors and offsets to their units of measure."""
     scaled = mapping.time_scale is not None or mapping.timestamp is not None
     wanted = [] if mapping.time is None else [(mapping.time, "" if scaled else "s")]
@@ -389,8 +388,7 @@ def _places(
         problem = f"one header line is needed, found numbers in the first line: {list(table.fields)}"
         raise DataError(f"Reading {table.path}: {problem}; put the names of the columns first, or set header = false.")
     at = tuple(_position(table, *column) for column in wanted)
-    pairs = [_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True)]
-    return at, tuple(factor for factor, _ in pairs), tuple(offset for _, offset in pairs)
+    return at, tuple(_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True))
 
 
 def _conversion(table: Table, at: int, column: Column, declared: str, known: dict[Column, str]) -> tuple[float, float]:

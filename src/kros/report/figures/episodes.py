@@ -59,7 +59,7 @@ def free_run(run: RunFolder) -> Captioned:
     if not shown.models:
         raise NotShownError("no model was simulated on the episode that is shown")
     lines = {model_label(n): (values, model_look(n)) for n, values in shown.models.items()}
-    block = Block(episode_title(shown.key), shown, lines, range(min(len(run.states), DRAWING.states)))
+    block = Block(episode_title(shown.key), shown, lines, range(len(run.states))[: DRAWING.states])
     text = "Simulation from the first recorded state with the recorded inputs, without measurements."
     return _figure(run, [block], text)
 
@@ -73,7 +73,7 @@ def estimates(run: RunFolder, paper: bool = False) -> Captioned:
     names = observer_pair(published(known)) if paper else observer_pair(known, run.deployed)
     if not names:
         raise NotShownError("the paper's observers are designed with identify.refine = false alone")
-    states = range(min(len(run.states), DRAWING.states)) if paper else run.hidden[:2]
+    states = (range(len(run.states)) if paper else run.hidden)[: DRAWING.states]
     blocks = [
         _observed(f"{role}: unit {one.key.unit}, episode {one.key.episode}", one, names, states)
         for role, one in zip(("nominal", "worst off-nominal"), shown, strict=False)
@@ -90,7 +90,7 @@ def other_condition(run: RunFolder) -> Captioned:
         raise NotShownError("the recordings have one condition only")
     pair = observer_pair(published(shown.observers))
     names = pair or observer_pair(shown.observers, run.deployed)
-    block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), DRAWING.states)))
+    block = _observed(episode_title(shown.key), shown, names, range(len(run.states))[: DRAWING.states])
     text = _PAPER if pair else ""
     text += f"Designed in “{condition_label(run.facts.identify_on)}” alone; errors are recorded minus estimated values."
     return _figure(run, [block], text)

@@ -42,25 +42,34 @@ def export_run(
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
         chosen, name = load_observer(context, observer), name or identifier(context.config.name)
         if fmi is not None:
-            return export_fmu(chosen, out, fmi, name, precision, track), ""
-        level = angle_load(context.config.estimator, chosen.sample_period_s)
-        load = LoadOutput(level, current=TRIAL.current) if observer.endswith("/load") else None
-        folder = export_c(chosen, out, name, precision, track, load)
-        write_json(folder / "study.json", context.config.dump())
-        return folder, "" if track else exactness(folder, chosen, context)
+            path, compared = export_fmu(chosen, out, fmi, name, precision, track), ""
+        else:
+            level = angle_load(context.config.estimator, chosen.sample_period_s)
+            load = LoadOutput(level, current=TRIAL.current) if observer.endswith("/load") else None
+            path = export_c(chosen, out, name, precision, track, load)
+            write_json(path / "study.json", context.config.dump())
+            compared = "" if track else exactness(path, chosen, context)
+        if precision == "float" and not compared:
+            log.warning("single precision was not compared with Python: its error on this observer is not known")
+        return path, compared
 
 
 def exactness(folder: Path, observer: Observer, context: Context) -> str:
-    """Return in words how far generated code is from Python on a held-out episode; refuse code that fails its test."""
+    """Return how far generated code is from Python on a held-out episode, if it can be run; refuse what fails its test.
+
+    A reason why it cannot be compared is a warning.
+    """
     if find_compiler() is None:
-        return "not compared with Python: there is no C compiler"
+        log.warning("not compared with Python: there is no C compiler")
+        return ""
     compiled = CompiledObserver.build(folder)
     if sample := compiled.selftest():
         raise ConfigError(f"Export: the self-test of {folder} fails at sample {sample}; do not use it, and report it.")
     try:
         arrived = held_out_episode(observer, context)
     except KrosError as error:
-        return f"not compared with Python, since the run's recordings cannot be read: {error}"
+        log.warning("not compared with Python, since the run's recordings cannot be read: %s", error)
+        return ""
     wanted = run_observer(observer, arrived.y, arrived.u, arrived.parameters)[1:, 0, : len(observer.recorded)]
     signals = observer.outputs, observer.inputs, observer.recorded
     of_y, of_u, of_x = (recorded_factors(observer, names) for names in signals)

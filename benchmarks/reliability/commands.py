@@ -200,7 +200,7 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
     keys += (
         "lifting.functions",
         "lifting.families",
-        "estimator.longest",
+        "estimator.delays",
         "estimator.order",
         "data.prepare",
         "data.source",

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from batches import batch_of, run_with_status
+from machines import filters
 from recorded_plant import DT, FEW, LIFTING, plant
 
 import kros
@@ -46,19 +47,24 @@ def motors() -> tuple[Observer, EpisodeBatch]:
     return found.observer, EpisodeBatch.read(population, list(population.keys()))
 
 
-def test_a_bank_is_its_system_and_blocks_are_sums_of_steps():
+def test_a_bank_is_its_system():
     rng = np.random.default_rng(0)
-    bank = Bank(4, 3, 1, (0, 1, 2, 4, 7, 12), (5.0, 20.0), (2.0, 8.0), (8 + 3j, 20 - 4j))
+    bank = Bank(4, 3, 1, 12, (5.0, 20.0), (2.0, 8.0), (8 + 3j, 20 - 4j))
     v = np.column_stack([rng.normal(size=(60, 3)), np.ones(60)])
-    coarse, fine = bank.rows(v, np.arange(60)), bank.fine.rows(v, np.arange(60))
-    A, B, S = bank.fine.system()
+    rows = bank.rows(v, np.arange(60))
+    A, B, S = bank.system()
     state = S @ v[0]
     for k in range(60):
         state = A @ state + B @ v[k]
-        np.testing.assert_allclose(state, fine[k], atol=1e-12)
-    coefficients = rng.normal(size=(len(bank), 2))
-    np.testing.assert_allclose(coarse @ coefficients, fine @ bank.refined(coefficients), atol=1e-12)
-    assert (len(bank), len(bank.fine)) == (coarse.shape[1], fine.shape[1])
+        np.testing.assert_allclose(state, rows[k], atol=1e-12)
+    assert len(bank) == rows.shape[1]
+    begin, first = np.repeat([7, 20], 30), rng.normal(size=(60, 4))
+    first[:30], first[30:], first[:, 3] = first[0], first[30], 1.0
+    at = begin + np.tile(np.arange(30), 2)
+    for k, one in ((7, first[0]), (20, first[30])):
+        some = begin == k
+        alone = bank.rows(np.vstack([one, v[k + 1 :]]), at[some] - k) - rows[at[some]]
+        np.testing.assert_allclose(bank.restarted(v, first, begin, at)[some], alone, atol=1e-12)
 
 
 def test_a_lifting_that_makes_models_affine_has_the_same_channels():
@@ -94,7 +100,7 @@ def test_an_exact_plant_is_estimated_exactly(exact):
     found, batches = exact
     batch = next(iter(batches.values()))
     estimate = run_observer(found.observer, batch.states[..., :1], batch.inputs)
-    late = FEW.longest + 1  # what was before the first sample is unknown until delays have passed it
+    late = FEW.delays + 1  # what was before the first sample is unknown until delays have passed it
     error = np.sqrt(np.mean((estimate[late:, 0, :3] - batch.states[late:, 0]) ** 2, axis=0))
     assert (error[1:] < 1e-3 * np.abs(batch.states).max(axis=(0, 1))[1:]).all()
 
@@ -107,7 +113,7 @@ def test_reduced_filters_are_stable_at_every_order_and_tend_to_the_bank():
     wanted = readout.design.bank.rows(v, np.arange(len(v))) @ readout.coefficients
     apart = []
     for order in (1, 3, 6, 12):
-        filters = reduced(readout, readout.design.fine.sample(), order)
+        filters = reduced(readout, order)
         assert np.abs(np.linalg.eigvals(filters.A)).max() < 1
         z, estimates = filters.S @ v[0], []
         for row in v:
@@ -140,10 +146,10 @@ def test_a_reduction_keeps_its_digits_where_coefficients_cancel():
     batch = next(iter(batches.values()))
     v = channels.signals(batch.states[:, 0, :1], batch.inputs[:, 0], {})
     wanted = bank.rows(v, np.arange(len(v))) @ readout.coefficients
-    lag = len(channels) - 1 + bank.delayed * (len(bank.taps) - 2)
+    lag = len(channels) - 1 + bank.delayed * (bank.delays - 1)
     large = readout.coefficients.copy()
     large[lag : lag + 2] += 1e10 * np.outer([2.0, -1.0], errors)
-    filters = reduced(replace(readout, coefficients=large), readout.design.fine.sample())
+    filters = reduced(replace(readout, coefficients=large))
     z, estimates = filters.S @ v[0], []
     for row in v:
         estimates.append(filters.C @ z + filters.D @ row)
@@ -194,7 +200,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     expected = np.zeros_like(X)
     of_y = np.flatnonzero(bank.channel == 0)
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
-    delays = bank.channels - 1 + np.arange(bank.delayed * (len(bank.taps) - 2))
+    delays = bank.channels - 1 + np.arange(bank.delayed * (bank.delays - 1))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
     moved = made.errors(X)[-1][-1]
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
@@ -359,7 +365,7 @@ def from_rest(places: list[float], seed: int) -> tuple[Recordings, dict]:
 
 def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_too():
     lifting = Lifting(("position", "velocity"))
-    rng, settings = np.random.default_rng(3), {"dense": 8, "longest": 16, "rows": 20_000}
+    rng, settings = np.random.default_rng(3), {"delays": 16, "rows": 20_000}
     recordings, _ = from_rest(list(rng.uniform(-2, 2, 6)), 1)
     unseen = from_rest(list(rng.uniform(-2, 2, 4)), 2)[1]
     errors = []
@@ -374,6 +380,29 @@ def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_to
     speed = np.sqrt(np.mean([b.states[..., 1] ** 2 for b in unseen.values()]))
     assert errors[1][1] < 0.5 * errors[0][1]
     assert errors[1][0] < 0.05 * speed
+
+
+def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well():
+    rng, batches = np.random.default_rng(0), {}
+    for episode, place in enumerate([1.0, 1.1, 1.25, 1.4, 1.5, -2.0]):
+        for unit in ("a", "b", "c", "d"):
+            x, u = np.zeros((400, 2)), np.full((400, 1), place)
+            u[20:] += 3.0 * np.cumsum(rng.standard_normal((380, 1)), axis=0) / 20
+            x[0] = place, 0.0
+            for k in range(399):
+                x[k + 1] = [[1.0, 0.01], [-0.5, 0.9]] @ x[k] + [0.0, 0.5 * u[k, 0] - 0.2 * np.sin(5 * x[k, 0])]
+            key = EpisodeKey(unit, "default", str(episode))
+            batches[key] = batch_of(x[:, None] + 1e-3 * rng.standard_normal((400, 1, 2)), u[:, None], 0.01)
+    recordings = Recordings.of([key for key in batches if key.episode != "5"], batches.__getitem__)
+    errors = []
+    for share in (1e-12, 0.03):
+        chosen = EstimatorSettings(delays=16, rows=20_000, restart_share=share)
+        lifting = Lifting(("position", "velocity"))
+        observer = identify_estimator("e", lifting, (0,), ("u",), recordings, 0.01, settings=chosen).observer
+        unseen = [b for key, b in batches.items() if key.episode == "5"]
+        off = [run_observer(observer, b.states[..., :1], b.inputs)[:50, 0, 1] - b.states[:50, 0, 1] for b in unseen]
+        errors.append(np.sqrt(np.mean(np.square(off))))
+    assert errors[1] < 0.4 * errors[0]
 
 
 def test_a_readout_of_its_own_counts_after_a_loss_until_the_slowest_filter_has_forgotten(motors):
@@ -462,6 +491,23 @@ def test_one_of_two_sensors_that_is_lost_for_ever_leaves_the_estimate_bounded(tw
     y[200:-200, :, lost] = np.nan
     estimate = run_observer(observer, y, u)[..., :3]
     assert (np.abs(estimate) < 3 * size).all()
+
+
+def test_gaps_are_bridged_by_straight_lines_through_functions_too():
+    # The filters after a gap are those of measurements along the line, but for the square of how far it moves them.
+    bank = filters()
+    bank = replace(bank, bank=replace(bank.bank, reach=np.full(3, 1e3)))
+    rng, length, begin, apart = np.random.default_rng(0), 12, 20, []
+    y, u = 0.1 * rng.normal(size=(40, 1, 1)), rng.normal(size=(40, 1, 2))
+    y[begin : begin + length] = np.nan
+    expected = run_observer(bank, y, u)[:, 0, 0]
+    for jump in (1e-5, 5e-6):
+        y[begin + length] = expected[begin + length] + jump * (length + 1)
+        line = y.copy()
+        line[begin : begin + length, 0, 0] = expected[begin : begin + length] + jump * np.arange(1, length + 1)
+        after, wanted = (run_observer(bank, one, u)[begin + length + 1, 0, 3:5] for one in (y, line))
+        apart.append(np.abs(after - wanted))
+    np.testing.assert_allclose(apart[0] / apart[1], 4.0, rtol=0.1)
 
 
 def test_a_filter_bank_starts_at_the_first_sample_with_all_measurements(two_sensors):

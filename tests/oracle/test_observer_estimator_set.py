@@ -220,7 +220,7 @@ def test_functions_of_the_model_count_and_others_are_refused():
 
 
 def test_every_entry_of_a_bank_belongs_to_the_channel_that_moves_it():
-    rng, bank = np.random.default_rng(0), Bank(4, 2, 1, (0, 1, 2, 4, 7, 12), (5.0, 20.0), (2.0, 8.0))
+    rng, bank = np.random.default_rng(0), Bank(4, 2, 1, 12, (5.0, 20.0), (2.0, 8.0))
     v = np.column_stack([rng.normal(size=(60, 3)), np.ones(60)])
     for channel in range(3):
         moved = v.copy()

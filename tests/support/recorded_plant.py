@@ -8,7 +8,7 @@ from kros.data import EpisodeBatch, EpisodeKey
 from kros.lifting import Lifting
 from kros.observer import EstimatorSettings, Recordings
 
-FEW = EstimatorSettings(rows=4000, sample=1500, dense=6, longest=20, gap_samples=1200, gap_episodes=4)
+FEW = EstimatorSettings(rows=4000, sample=1500, delays=20, gap_samples=1200, gap_episodes=4)
 DT = 0.01
 
 

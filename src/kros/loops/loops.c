@@ -277,7 +277,7 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
 }
 
 /* The fallback into the next estimates; ages and ramps move on. */
-static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, const mask *missing, vec *ramp, whole n, whole columns, whole w)
+static void follow(const formulas *f, const vec *reg, const relift_job *s, const vec *bank, vec *gap, vec *next, const mask *missing, vec *ramp, whole n, whole columns, whole w)
 {
     const whole r = s->filters, q = s->q, recorded = s->recorded;
     for (whole v = 0; v < w; v++) {
@@ -292,9 +292,11 @@ static void follow(const relift_job *s, const vec *bank, vec *gap, vec *next, co
             some |= lost;
             for (whole i = 0; i < r && moves; i++) {
                 const double *row = s->map + (recorded + i) * columns;
-                vec sum = row[s->measured[j]] * *count;
+                vec slope = (vec){0} + row[s->measured[j]], sum = {0};
+                for (const int32_t *by = f->slope; by < f->slope + 3 * f->slopes; by += 3)
+                    if (by[1] == j) slope += row[by[0]] * reg[by[2] * MOST + v];
                 for (whole l = 0; l < r; l++) sum += row[recorded + l] * of[l * MOST];
-                ramp[i] = sum;
+                ramp[i] = sum + slope * *count;
             }
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
@@ -376,7 +378,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                 if (s->own) product_each(each, columns, column, next, rows, w);
                 else product(map, counts, column, next, rows, w);
                 shifted(f, reg, older);
-                if (recorded) follow(s, bank, gap, next, (const mask *)missing, ramp, n, columns, w);
+                if (recorded) follow(f, reg, s, bank, gap, next, (const mask *)missing, ramp, n, columns, w);
                 if (!within(s, o, rows, next, lanes)) {
                     s->left[o] = 1;
                     break;

@@ -65,8 +65,7 @@ def load_observer(
     recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
     lag = settings.level_s / batch.sample_period_s
     estimator = EstimatorSettings(
-        dense=settings.delays,
-        longest=settings.delays,
+        delays=settings.delays,
         first_lag=lag,
         last_lag=lag / recordings.length,
         restart_share=settings.restart_share,

@@ -25,7 +25,8 @@ is left in long gaps.
 A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of
 states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so
 are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit
-ramp was run along, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g samples.
+ramp was run along, through the slopes of lifted functions at what stood for the measurement, and ``z`` is corrected by
+:math:`r (y - \hat y) / (g + 1)` after g samples.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ class Gaps:
         self.after_start, self.from_inputs, self.offset = (
             slice(n - k * recorded, n - (k - 1) * recorded) for k in (3, 2, 1)
         )
-        self._A, self._B = A[self.filters, self.filters], A[self.filters, :][:, self.measured]
+        self._A = A[self.filters, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
         self._most = np.where(self.hidden, bank.reach, np.inf)
         self.take(np.zeros((recorded + q + 1 + q * bank.filters, batch)))
@@ -112,8 +113,11 @@ class Gaps:
         offset += (1 - share) * (recorded - x[:, self.from_inputs] - offset)
         np.clip(offset, -self._most, self._most, out=offset)
 
-    def follow(self, following: Array, missing: Flags) -> None:
-        """Blend the fallback into the next states (batch, n) and move ages and ramps on."""
+    def follow(self, following: Array, missing: Flags, slopes: Array | None) -> None:
+        """Blend the fallback into the next states (batch, n) and move ages and ramps on.
+
+        Slopes are those of the next filters by the measurements, (batch, filters, q), where one is missing.
+        """
         bank, some = self.bank, np.asarray(missing.any(axis=1))
         count = np.where(missing, self.count + 1, 0.0)
         recovered = np.where(some[:, None], self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
@@ -126,9 +130,10 @@ class Gaps:
         at, reach = self.measured, bank.reach[self.measured]
         near = fallback[:, at] + np.clip(recorded[:, at] - fallback[:, at], -reach, reach)
         recorded[:, at] = np.where(some[:, None], near, recorded[:, at])
-        if some.any() or self.count.any():
-            ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
-            self.ramp[...] = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)
+        if slopes is None:
+            self.ramp[...] = 0.0
+        else:
+            self.ramp[...] = np.where(missing[:, None], self._A @ self.ramp + slopes * count[:, None], 0.0)
         self.age[...], self.count[...], self.start[...] = age, count, disturbed * bank.start_recovery
 
     @property

@@ -233,7 +233,8 @@ def _compiled(loops: Library, courses: Sequence[Course], samples: Screened) -> l
     states = np.empty((n_samples, len(courses), lifting.n_states, batch))
     states[:first] = [course.steps.x.T for course in courses]
     job = _job(courses, samples.rows(slice(first, None)), samples.u[first - delay : n_samples - delay])
-    of_lifting = formulas(lifting, values, samples.u.shape[2], batch)
+    lost = courses[0].steps.gaps is not None and not np.isfinite(samples.y).all()
+    of_lifting = formulas(lifting, values, samples.u.shape[2], batch, tuple(observer.measured) if lost else ())
     loops.call("kros_relift", of_lifting, ("relift_job", job | {"states": states[first:]}))
     moving = np.broadcast_to(np.arange(lead, n_samples)[:, None] >= first, (n_samples - lead, batch))
     runs, n, nl = list[Stepped | None](), lifting.n_states, lifting.n_lifted

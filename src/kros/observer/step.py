@@ -60,7 +60,7 @@ class Steps:
         theta, inputs = self.lifting.lift(window, self.values), self.lifting.lift_inputs(u, window, self.values)
         following = np.concatenate([theta, self.x_c, inputs, y], axis=-1) @ self._map.T
         if self.gaps is not None:
-            self.gaps.follow(following[:, :n], missing)
+            self.gaps.follow(following[:, :n], missing, self._into_filters(window, u) if missing.any() else None)
         within = ((following >= self._low) & (following <= self._high)).all(axis=-1)
         going = ~self.waiting if moving is None else moving & ~self.waiting
         self.waiting |= going & ~within  # a step that would leave the bounds is not taken
@@ -70,6 +70,15 @@ class Steps:
         if delays:
             np.copyto(self.past, self.lifting.window.advance(window, u), where=on)
             self.fresh &= ~on[:, 0]
+
+    def _into_filters(self, window: Array, u: Array) -> Array:
+        """Return the slopes of the next filters by the measurements, shape (batch, filters, q)."""
+        assert self.gaps is not None
+        observer, names = self.observer, self.lifting.states
+        by = tuple(names[i] for i in self._measured)
+        A, B = observer.A[self.gaps.filters], observer.B[self.gaps.filters, u.shape[1] :]
+        lifted = A[:, len(names) :] @ self.lifting.slopes(window, self.values, by)
+        return A[:, self._measured] + lifted + B @ self.lifting.slopes(window, self.values, by, u)
 
 
 def forward(observer: ObserverData, values: Parameters, count: Index, x: Array, earlier: Array, u: Array) -> Array:

@@ -96,6 +96,7 @@ class Source:
             "single": self.precision.type == "float",
             "monitor": o.monitor,
             "bank": o.bank,
+            "bridges": self.bridges(),
             "shift": self.shift,
             "shift_others": self.shift_others,
             "load": self.load_torque(),
@@ -161,6 +162,21 @@ class Source:
     def literals(self, factors: Sequence[float]) -> list[str]:
         """Return the literals of factors in double precision; none where all are one."""
         return [] if all(factor == 1 for factor in factors) else row(np.array(factors))
+
+    def bridges(self) -> list[Record]:
+        """Return slopes of functions by every measurement, and by what they and ramps go into ramps of the filters."""
+        o, found = self.observer, list[Record]()
+        if o.bank is None:
+            return found
+        n, m = o.lifting.n_states, len(o.inputs)
+        filters = slice(len(o.recorded), len(o.recorded) + o.bank.filters)
+        A, functions = o.A[filters], np.hstack([o.A[:, n:], o.B[:, m:]])[filters]
+        for i, output in zip(o.measured, o.outputs, strict=True):
+            trees = [f.derivative(output) for f in (*o.lifting.formulas, *o.lifting.input_formulas)]
+            moving = [j for j, tree in enumerate(trees) if tree != 0]
+            rows = np.column_stack([A[:, i], functions[:, moving], A[:, filters]])
+            found.append({"slopes": [f"({self.code(trees[j])})" for j in moving], "rows": self.sums(rows)})
+        return found
 
     def tracked(self, loop: PhaseLockedLoop) -> Record:
         """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""

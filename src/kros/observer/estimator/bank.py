@@ -2,19 +2,16 @@ r"""The bank: delays and first-order lags of channels, and the decaying values o
 
 For a channel v the bank holds
 
-.. math:: v_k, \quad m_i - m_{i+1}, \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
+.. math:: v_k, \quad v_{k-i} - v_{k-i-1}, \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
 
-with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. A resonance is a
-lag with a complex time constant, real and imaginary part. Before the first sample everything is taken to equal it. As a
-system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`, :math:`\xi_{-1} = S v_0` (v ends with the constant
-channel 1), it is stable.
+and for the start :math:`e^{-k/\tau} [1, v_0]`. A resonance is a lag with a complex time constant, real and imaginary
+part. Before the first sample everything is taken to equal it. As a system, :math:`\xi_k = A \xi_{k-1} + B v_k`,
+:math:`\xi_{-1} = S v_0` (v ends with the constant channel 1), it is stable.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -32,7 +29,7 @@ class Bank:
     channels: int
     linear: int  # the first so many channels are linear in measurements and inputs
     memoryless: int  # so many channels before the constant have no delays
-    taps: tuple[int, ...]  # where blocks of delays begin, in samples, from zero on, and where the last one ends
+    delays: int  # samples
     lags: tuple[float, ...]  # samples
     starts: tuple[float, ...]  # samples
     resonances: tuple[complex, ...] = ()  # samples
@@ -42,9 +39,9 @@ class Bank:
         """Return the bank for a median episode of this length in samples; complex poles become resonances."""
         lags = () if channels.recent else settings.lags(length)
         starts = () if channels.recent else (*settings.start, *lags)
-        taps, slowest = settings.blocks(length), np.exp(-1 / length)
+        delays, slowest = settings.longest(length), np.exp(-1 / length)
         resonances = tuple(-1 / np.log(p * min(1.0, slowest / abs(p))) for p in poles if p.imag > 0)
-        return cls(len(channels), channels.linear, channels.nonlinear, taps, lags, starts, resonances)
+        return cls(len(channels), channels.linear, channels.nonlinear, delays, lags, starts, resonances)
 
     @property
     def delayed(self) -> int:
@@ -58,27 +55,49 @@ class Bank:
     def channel(self) -> Whole:
         """Channel of every entry, shape (len(self),)."""
         every, moving = np.arange(self.channels), np.arange(self.channels - 1)
-        blocks = [moving[: self.delayed]] * (len(self.taps) - 2)
+        steps = [moving[: self.delayed]] * (self.delays - 1)
         lags = [moving] * (len(self.lags) + 2 * len(self.resonances))
-        return np.concatenate([moving, *blocks, *lags, *[every] * len(self.starts), every[-1:]])
+        return np.concatenate([moving, *steps, *lags, *[every] * len(self.starts), every[-1:]])
 
     def rows(self, v: Array, at: Whole) -> Array:
         """Return the bank at samples `at` of signals v (n_samples, channels), shape (len(at), len(self))."""
         moving, past = v[:, :-1], v[:, : self.delayed]
-        before = np.concatenate([np.repeat(past[:1], self.taps[-1], axis=0), past])
-        sums = np.concatenate([np.zeros((1, self.delayed)), np.cumsum(before - past[:1], axis=0)])
-        ends = [(tap, sums[at + self.taps[-1] + 1 - tap]) for tap in self.taps]
-        means = [(one - other) / (b - a) for (a, one), (b, other) in pairwise(ends)]
-        parts = [moving[at], *(one - other for one, other in pairwise(means))]
+        steps = np.concatenate([np.zeros((self.delays, self.delayed)), np.diff(past, axis=0)])
+        parts = [moving[at], *(steps[at + self.delays - 1 - i] for i in range(self.delays - 1))]
         for lags in filter(None, (self.lags, self.resonances)):
             values = lagged(moving, np.exp(-1 / np.array(lags)), at)
             parts += [values.real, values.imag] if np.iscomplexobj(values) else [values]
-        parts += [np.exp(-at / tau)[:, None] * v[0] for tau in self.starts]
-        return np.hstack([*parts, np.ones((len(at), 1))])
+        return np.hstack([*parts, self.started(v[0], at), np.ones((len(at), 1))])
+
+    def started(self, first: Array, at: Whole) -> Array:
+        """Return the entries of a first sample (channels,), or one for each row, at samples `at`."""
+        decays = np.exp(-at[:, None] / np.array(self.starts))
+        return (decays[..., None] * np.expand_dims(first, -2)).reshape(len(at), -1)
+
+    def restarted(self, v: Array, first: Array, begin: Whole, at: Whole) -> Array:
+        """Return by how much rows at samples `at` change where signals v start at samples `begin`, not after them.
+
+        The signals are then `first` (len(at), channels) at these samples, and before.
+        """
+        past, now, age = self.rows(v, begin), self.rows(v, at), (at - begin)[:, None]
+        count, moving, other = len(at), self.channels - 1, (first - v[begin])[:, :-1]
+        filters = np.multiply(moving, [len(self.lags), len(self.resonances), len(self.resonances)])
+        ends = np.cumsum([moving, (self.delays - 1) * self.delayed, *filters])
+        _, _, lags, real, imaginary, _ = np.split(past, ends, axis=1)
+        steps, delay = now[:, ends[0] : ends[1]].reshape(count, -1, self.delayed), np.arange(self.delays - 1)
+        steps = np.where((delay >= age)[..., None], -steps, 0.0)
+        steps -= (delay == age - 1)[..., None] * other[:, None, : self.delayed]
+        parts = [np.where(age == 0, other, 0.0), steps.reshape(count, -1)]
+        for tau, filtered in ((self.lags, lags), (self.resonances, real + 1j * imaginary)):
+            gone = np.exp(-age / np.array(tau))[..., None]
+            change = (gone * (first[:, None, :-1] - filtered.reshape(count, -1, moving))).reshape(count, -1)
+            parts += [change.real, change.imag] if np.iscomplexobj(change) else [change]
+        starts = self.started(first, age[:, 0]) - self.started(v[0], at)
+        return np.hstack([*parts, starts, np.zeros((count, 1))])
 
     def sizes(self, rms: Array) -> Array:
         """Return the sizes of entries, their RMS; for the start of its decay by the channel's: many start at rest."""
-        size, first, moving = rms.copy(), self._first, self.channels - 1
+        size, first, moving = rms.copy(), self.first, self.channels - 1
         size[first] = np.outer(rms[first][moving :: self.channels], [*rms[:moving], 1.0]).ravel()
         return np.maximum(size, ITERATED * size.max())
 
@@ -88,34 +107,17 @@ class Bank:
         return np.where((channel >= self.linear) & (channel < self.channels - 1), nonlinear, 0.0)
 
     @property
-    def _first(self) -> slice:
+    def first(self) -> slice:
         """Entries of the first sample."""
         return slice(-1 - len(self.starts) * self.channels, -1)
 
-    @property
-    def fine(self) -> Bank:
-        """The bank with every delay up to the longest."""
-        return replace(self, taps=tuple(range(self.taps[-1] + 1)))
-
-    def refined(self, coefficients: Array) -> Array:
-        """Return coefficients (p, n) of this bank as those of `fine`."""
-        moving, blocks, last = self.channels - 1, len(self.taps) - 1, self.taps[-1]
-        means = np.zeros((blocks, last))
-        for i, (a, b) in enumerate(pairwise(self.taps)):
-            means[i, a:b] = 1 / (b - a)
-        steps = (means[:-1] - means[1:]) @ -np.tril(np.ones((last, last - 1)), -1)  # v_{k-j} = v_k - sum of steps
-        count = (blocks - 1) * self.delayed
-        each = coefficients[moving : moving + count].reshape(blocks - 1, -1)
-        fine = (steps.T @ each).reshape(-1, coefficients.shape[1])
-        return np.concatenate([coefficients[:moving], fine, coefficients[moving + count :]])
-
     def system(self) -> tuple[Array, Array, Array]:
-        """Return A (p, p), B (p, channels) and S (p, channels) of a bank with every delay."""
+        """Return A (p, p), B (p, channels) and S (p, channels)."""
         size, c, moving, delayed = len(self), self.channels, self.channels - 1, self.delayed
         A, B, S = np.zeros((size, size)), np.zeros((size, c)), np.zeros((size, c))
         B[range(moving), range(moving)] = S[range(moving), range(moving)] = 1.0
         place = moving
-        for i in range(self.taps[-1] - 1):
+        for i in range(self.delays - 1):
             rows = np.arange(place, place + delayed)
             if i == 0:
                 B[rows, range(delayed)], A[rows, range(delayed)] = 1.0, -1.0

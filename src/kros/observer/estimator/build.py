@@ -75,7 +75,7 @@ def identify_estimator(
     >>> from kros.observer import EstimatorSettings, Recordings, identify_estimator
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
-    >>> few = EstimatorSettings(rows=2000, sample=1000, dense=4, longest=8)
+    >>> few = EstimatorSettings(rows=2000, sample=1000, delays=8)
     >>> lifting = Lifting(motors.states)
     >>> found = identify_estimator("motor", lifting, (0,), motors.inputs, recordings, 0.001, settings=few)
     >>> found.observer.recorded, sorted(found.facts["left_out_percent"])
@@ -91,11 +91,9 @@ def identify_estimator(
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
         return assembled(name, lifting, inputs, readout.design, (filters, fallback), sample_period_s, parameters or {})
 
-    fine, blind_fine = (one.design.fine.sample() for one in (readout, blind))
-
     def filters_of(one: Readout, other: Readout) -> tuple[Filters, Filters]:
         both = np.hstack([one.coefficients, one.careful])
-        return reduced(one, fine, settings.order, both), reduced(other, blind_fine, settings.order)
+        return reduced(one, settings.order, both), reduced(other, settings.order)
 
     filters, fallback = filters_of(readout, blind)
     observer = observer_of(filters, fallback)
@@ -204,7 +202,7 @@ def assembled(
 ) -> Observer:
     """Write filters with their readouts, and those of inputs alone, into the model of an observer."""
     channels, bank = design.channels, design.bank
-    without, slowest = channels.without_measurements(), max([*bank.lags, bank.taps[-1]])
+    without, slowest = channels.without_measurements(), max([*bank.lags, bank.delays])
     filters, fallback = systems[0].absolute(channels), systems[1].absolute(without)
     n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
     bare = channels.lifting

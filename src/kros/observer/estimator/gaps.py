@@ -96,7 +96,7 @@ def with_gaps(
         side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
         shown = np.where(lost[..., None] & some, np.nan, y)
         filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
-        longest = settings.blocks(recordings.length)[-1]
+        longest = settings.longest(recordings.length)
         ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
         T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
         filtered[..., list(trial.measured)] = states[..., list(trial.measured)]

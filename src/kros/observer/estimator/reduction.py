@@ -73,26 +73,23 @@ class Filters:
         return z @ self.C.T + v @ self.D.T
 
 
-def reduced(
-    readout: Readout, fine: tuple[Array, Array], order: int | None = None, coefficients: Array | None = None
-) -> Filters:
+def reduced(readout: Readout, order: int | None = None, coefficients: Array | None = None) -> Filters:
     """Return the filters of a readout, reduced until left-out errors grow by a share, or to an order.
 
-    The covariance is that of thinned rows of the bank with every delay, with their weights. Other coefficients may take
-    the place of the readout's, for the states once or more.
+    The covariance is that of thinned rows of the bank. Other coefficients may take the place of the readout's, for the
+    states once or more.
     """
     design, coefficients = readout.design, readout.coefficients if coefficients is None else coefficients
     errors = readout.typical * design.recordings.size
     errors[list(design.channels.measured)] *= design.settings.measured_loss
     errors = np.tile(errors, coefficients.shape[1] // len(errors))
-    A, B, S = design.bank.fine.system()
-    weights = design.bank.refined(coefficients).T
-    X, w = fine
+    A, B, S = design.bank.system()
+    X, w = readout.sample
     size = np.sqrt(w @ (X * X))
     size = np.where(size > 0, size, 1.0)
     A, B, S = A * size / size[:, None], B / size[:, None], S / size[:, None]
-    C = weights * size @ A
-    D = weights * size @ B
+    C = coefficients.T * size @ A
+    D = coefficients.T * size @ B
     used = np.isfinite(errors) & (errors > 0)
     root = gramian_root(A.T, (C[used] / errors[used, None]).T).T
     _, values, U = np.linalg.svd(root, full_matrices=False)
@@ -104,7 +101,7 @@ def reduced(
     whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
     if order is not None:
         return whole.first(order).modal()
-    signals = design.sample_signals(_EPISODES, round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
+    signals = design.sample_signals(_EPISODES, round(10 * max([*design.bank.lags, design.bank.delays])))
     every, most = np.arange(len(signals)), 2 * design.settings.loss
     wanted = np.stack([design.bank.rows(v, every) @ coefficients for v in signals.swapaxes(0, 1)], axis=1)
 

@@ -184,23 +184,22 @@ class Design:
     def errors(self, rows: Array) -> list[tuple[float, float, Array]]:
         """Return by how much rows of `sample` may be wrong, with weights for all time and after a disturbance."""
         settings, bias, rng = self.settings, self.recordings.bias, np.random.default_rng(self.settings.seed)
-        biased, bridged, restarts = list[Array](), list[Array](), list[Array]()
+        biased, bridged, restarts, elsewhere = (list[Array]() for _ in range(4))
         for _, batch, at, _ in self.episodes(self.recordings.some(settings.sample_episodes), settings.sample):
             y = self.measurements(batch)
             v = self.signals(batch, y)
-            started, places = np.empty((len(at), len(self.bank))), at.copy()
-            for part in (slice(i, None, settings.restarts) for i in range(settings.restarts)):
-                begin = int(rng.integers(0, len(v) // 2))
-                after = np.minimum(at[part], len(v) - begin - 2)
-                started[part], places[part] = self.seen(v[begin:], after), begin + after
-            restarts.append(started - self.seen(v, places))
+            begin = (rng.random(len(at)) * (len(v) - 1 - at)).astype(int)
+            signals, first = self.channels.filtered(v), self.channels.filtered(v[None, begin])[0]
+            restarts.append(self.bank.restarted(signals, first, begin, begin + at))
+            elsewhere.append(np.zeros_like(restarts[-1]))
+            elsewhere[-1][:, self.bank.first] = self.bank.started(first - signals[0], at)
             if not self.channels.inputs_only:
                 lost = np.random.default_rng(settings.seed).random(len(y)) < 0.5
                 line = interpolated(np.where(lost[:, None], np.nan, y))
                 bridged.append(self.seen(self.signals(batch, line), at))
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
                 biased.append(self.seen(self.signals(batch, y + bias), at))
-        errors = [(0.0, 1.0, np.vstack(restarts))]
+        errors = [(0.0, 1.0, np.vstack(restarts)), (settings.restart_share, 0.0, np.vstack(elsewhere))]
         for share, wrong in ((settings.gap_share, bridged), (1.0, biased)):
             errors += [(share, 0.0, np.vstack(wrong) - rows)] if wrong else []
         return errors
@@ -231,11 +230,6 @@ class Design:
         keys, folds, parts = self.recordings.keys, self.settings.folds, self.settings.parts
         names, units = sorted({k.episode for k in keys}), list(dict.fromkeys(k.unit for k in keys))
         return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
-
-    @property
-    def fine(self) -> Design:
-        """The design of the bank with every delay."""
-        return replace(self, bank=self.bank.fine)
 
 
 def in_step(designs: Sequence[Design], recordings: Recordings, rows: int) -> Iterator[tuple[Rows, ...]]:

@@ -14,8 +14,8 @@ class EstimatorSettings(Settings):
     Examples
     --------
     >>> from kros.observer import EstimatorSettings
-    >>> EstimatorSettings(dense=2, longest=8).blocks(6000), EstimatorSettings(first_lag=500.0).lags(6000)
-    ((0, 1, 2, 4, 6, 8), (300.0, 600.0))
+    >>> EstimatorSettings(first_lag=500.0).lags(6000), EstimatorSettings().longest(200)
+    ((300.0, 600.0), 50)
     """
 
     unbounded: dict[str, tuple[str, ...]] = Field(
@@ -23,11 +23,9 @@ class EstimatorSettings(Settings):
         description="measured states that may go on for ever, such as the position of a spindle, with the inputs that "
         "go on with them, such as its reference; the estimator sees their changes and distances alone",
     )
-    dense: int = Field(32, ge=1, description="delays of every linear channel that are taken one by one, in samples")
-    longest: int = Field(
-        100, ge=1, description="longest delay, in samples; a short episode allows a quarter of its length"
+    delays: int = Field(
+        100, ge=1, description="delays of every linear channel, in samples; a short episode allows a quarter of it"
     )
-    growth: float = Field(1.3, gt=1, description="ratio of the widths of blocks of delays beyond the dense ones")
     first_lag: float = Field(16.0, gt=0, description="shortest time constant of the first-order lags, in samples")
     lag_ratio: float = Field(2.0, gt=1, description="ratio of successive time constants")
     last_lag: float = Field(0.1, gt=0, description="longest time constant, as a share of the median training episode")
@@ -59,13 +57,14 @@ class EstimatorSettings(Settings):
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )
     restart_share: float = Field(
-        0.1,
+        0.03,
         gt=0,
-        description="weight of the errors that a start in the middle of an episode makes, for the time after a start "
-        "or a loss: rows with target zero, since machines start elsewhere than in recordings",
+        description="weight of the errors that a start elsewhere makes and, for the time after a start or a loss, one "
+        "in the middle of an episode: rows with target zero, since machines start elsewhere than in recordings",
     )
-    settled_share: float = Field(1e-5, gt=0, description="weight of these errors for all other time")
-    restarts: int = Field(8, ge=1, description="such starts of every episode")
+    settled_share: float = Field(
+        1e-3, gt=0, description="weight of the errors of a start in the middle of an episode for all other time"
+    )
     gap_share: float = Field(
         1e-3,
         ge=0,
@@ -119,12 +118,6 @@ class EstimatorSettings(Settings):
         count = max(0, int(np.ceil(np.log(last / self.first_lag) / np.log(self.lag_ratio) - ITERATED)))
         return tuple(last / self.lag_ratio**i for i in range(count, -1, -1))
 
-    def blocks(self, length: float) -> tuple[int, ...]:
-        """Return where blocks of delays begin, and the end of the last one, in samples."""
-        longest = max(2, min(self.longest, int(length // 4)))
-        edges = list(range(min(self.dense, longest) + 1))
-        width = 1.0
-        while edges[-1] < longest:
-            width *= self.growth
-            edges.append(min(longest, edges[-1] + int(np.ceil(width))))
-        return tuple(edges)
+    def longest(self, length: float) -> int:
+        """Return the number of delays for a median episode of this length in samples."""
+        return max(2, min(self.delays, int(length // 4)))

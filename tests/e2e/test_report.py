@@ -13,9 +13,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+from browser import printed_pages, probe
 from matplotlib.figure import Figure
 from scipy.signal import welch
-from tests.support.browser import printed_pages, probe
 
 import kros as package
 from kros.core.artifacts import save_artifact, write_json

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.batches import batch_of
+from batches import batch_of
 
 from kros.core.errors import ConfigError
 from kros.core.lti import gain

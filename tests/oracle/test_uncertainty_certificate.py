@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.support.residuals import of_systems
+from residuals import of_systems
 
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm

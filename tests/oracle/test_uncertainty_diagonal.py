@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from tests.support.residuals import of_function
+from residuals import of_function
 
 from kros.core import StateSpace
 from kros.uncertainty.weights.cover import NEPER_DB

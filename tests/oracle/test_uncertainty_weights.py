@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from residuals import of_function
 from scipy.linalg import expm
-from tests.support.residuals import of_function
 
 from kros.core import StateSpace
 from kros.uncertainty import quantify

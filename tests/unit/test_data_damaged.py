@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow import parquet
-from tests.support.scans import scan_digests
+from scans import scan_digests
 
 from kros.core import limits
 from kros.core.errors import DataError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.support.residuals import of_systems
+from residuals import of_systems
 
 from kros.core import KrosError, StateSpace
 from kros.core.frequency import log_grid

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
+
+os.environ["OMP_NUM_THREADS"] = "1"  # before NumPy: processes of several threads each would wait for one another
+
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -49,6 +53,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             f"tests/conftest.py, DEMO: should name {', '.join(sorted(unknown))}, which needs the demo's study."
         )
     items.sort(key=lambda item: LONGEST.index(groups[item.nodeid]) if groups[item.nodeid] in LONGEST else len(LONGEST))
+
+
+def pytest_collection_finish() -> None:
+    """Take what was imported and collected out of garbage collection, which would go through all of it many times."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)

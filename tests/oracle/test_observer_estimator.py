@@ -320,23 +320,6 @@ def test_estimates_stay_inside_declared_limits():
         identify_estimator("motor", *parts, settings=wrong)
 
 
-def test_units_of_measure_change_nothing():
-    recordings, batches = plant(units=3, spread=0.1)
-    factors, u_factor = np.array([1000.0, 60.0, 0.01]), 7.0
-    scaled = {
-        key: replace(batch, states=batch.states * factors, inputs=batch.inputs * u_factor)
-        for key, batch in batches.items()
-    }
-    other = Recordings.of(list(scaled), scaled.__getitem__)
-    one, two = (
-        identify_estimator("plant", LIFTING, (0,), ("u",), r, DT, settings=FEW).observer for r in (recordings, other)
-    )
-    batch = next(iter(batches.values()))
-    here = run_observer(one, batch.states[..., :1], batch.inputs)[..., :3]
-    there = run_observer(two, factors[0] * batch.states[..., :1], u_factor * batch.inputs)[..., :3] / factors
-    np.testing.assert_allclose(here, there, atol=1e-4 * np.abs(here).max())
-
-
 def test_families_grow_and_a_measurement_that_never_arrives_is_refused():
     recordings, _ = plant(units=2, episodes=1)
     sizes = [len(design(recordings, family).bank) for family in FAMILIES]
@@ -450,7 +433,9 @@ def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():
 
 def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():
     pendulums = kros.plants.PendulumPopulation(n_units=5, n_episodes=4, seconds=10.0, seed=3).simulate().population
-    uncertain = kros.quantify(kros.identify(pendulums, lifting=["sin(position)"], refine=False), n_freqs=50)
+    uncertain = kros.quantify(
+        kros.identify(pendulums, lifting=["sin(position)"], refine=False), n_freqs=50, max_order=1
+    )
     designs = [
         kros.synthesize(uncertain, f"koopman_edmd/{method}", methods=()) for method in ("estimator", "open_loop")
     ]

@@ -84,7 +84,7 @@ def test_a_batch_one_machine_and_c_agree(delay, guard, tmp_path):
     if not guard:
         y[50:] = np.nan  # grows without bounds until it is no number
         y[-20:] = 0.5
-        y, u = (np.repeat(a[:, ::2], 7, axis=0) for a in (y, u))
+        y, u = (np.repeat(a[:, ::3], 4, axis=0) for a in (y, u))
     batch, status = run_with_status(o, y, u)
     assert np.isfinite(batch).all()
     np.testing.assert_array_equal(run_observers([o, o], y, u)[1], batch)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from batches import batch_of, track_parameter
+from batches import track_parameter
 from random_models import random_observer
 
 from kros.core.errors import ConfigError, DataError, DimensionError
@@ -13,7 +13,6 @@ from kros.synthesis import Injection, kalman
 
 DT = 0.001
 LIFTING = Lifting(("position", "velocity", "current"), ("sin(10*position + phase)",), ("phase",))
-LATE = Lifting(("x", "v"), ("x[-2]*v", "sin(x)"), (), ("u",))
 
 
 def observer(lifting=LIFTING, runtime=None, order=2, m=2):
@@ -46,26 +45,6 @@ def test_filtered_estimate_of_a_kalman_predictor_is_the_kalman_filter():
     )  # predicting from the filtered state is the prediction
 
 
-@pytest.mark.parametrize("delay", [0, 1, 4, 50])
-@pytest.mark.parametrize("lifting", [LIFTING, LATE], ids=["drive", "delays"])
-def test_batched_and_single_runs_agree_with_gaps_delays_and_limits(lifting, delay):
-    n, m = lifting.n_states, 2 if lifting is LIFTING else 1
-    limits = {"lower": np.full(n, -0.8), "upper": np.array([np.inf, 0.5, 0.7][:n])}
-    o = observer(lifting, Runtime(delay, **limits), m=m)
-    y, u = recordings(m)
-    y[[5, 6, 20]] = np.nan
-    y[30, 0] = np.inf
-    found = run_observer(o, y, u)
-    assert np.isfinite(found).all()
-    assert found[1:, :, 1].max() <= 0.5
-    for i in range(y.shape[1]):
-        running, single = o.start(y[0, i]), []
-        for k in range(len(y)):
-            single.append(running.estimate)
-            running.step(y[k, i], u[k, i])
-        np.testing.assert_allclose(found[:, i], single, rtol=1e-10, atol=1e-10)
-
-
 def test_a_late_measurement_of_an_exact_model_costs_nothing():
     F, G = np.array([[1.0, 0.01], [-0.5, 0.95]]), np.array([[0.0], [1.0]])
     plain, K = Lifting(("x", "v")), gain([[0.6], [5.0]], DT)
@@ -77,18 +56,6 @@ def test_a_late_measurement_of_an_exact_model_costs_nothing():
     right = Observer("o", plain, F, G, (0,), ("u",), K, Injection.STATE, DT, runtime=Runtime(delay=7))
     np.testing.assert_allclose(run_observer(right, late, u), x, atol=1e-9)
     assert np.abs(run_observer(wrong, late, u) - x).max() > 0.1
-
-
-def test_a_missing_measurement_corrects_nothing():
-    o = observer(order=0)
-    y, u = recordings()
-    silent = Observer.open_loop("s", LIFTING, o.A, o.B, (0,), ("a", "b"), DT)
-    y[1:] = np.nan
-    y[0] = 0.0
-    np.testing.assert_allclose(
-        run_observer(o, y, u, {"phase": 0.3}), run_observer(silent, np.zeros_like(y), u, {"phase": 0.3}), atol=1e-12
-    )
-    assert np.isfinite(o.start([np.nan]).estimate).all()
 
 
 def test_a_runtime_that_makes_no_sense_is_refused():
@@ -127,28 +94,6 @@ def test_phase_locked_loop_finds_the_phase_in_both_directions():
     assert np.all(
         np.std((tracked.estimates - x)[2000:, :, 1], axis=0) < 0.7 * np.std((as_at_first - x)[2000:, :, 1], axis=0)
     )
-
-
-def test_phase_locked_loop_finds_the_phase_of_a_simulated_drive():
-    from kros.core.artifacts import plain
-    from kros.observer.residual import one_step_rows
-    from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
-
-    simulated = HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=8.0, conditions=("noload",), seed=3).simulate()
-    values = simulated.population.read(simulated.population.episodes[0])[:, None]
-    states, inputs = values[..., :3], np.ascontiguousarray(values[..., 3:])
-    true = plain(simulated.truth.as_dict())["units"]["001001"]["phase_rad"][0]
-    lifting = Lifting(("position", "velocity", "current"), ("sin(100*position + phase)",), ("phase",))
-    rows = one_step_rows(lifting, batch_of(states, inputs, DT, {"phase": [true]}))
-    A, B = np.vstack([rows[0], np.zeros((1, 4))]), np.vstack([rows[1], np.zeros((1, 2))])
-    K = kalman(A[:3, :3], np.eye(1, 3), np.diag([1e-13, 1e-6, 1e-5]), np.array([[1e-12]]), DT).controller
-    o = Observer("o", lifting, A, B, (0,), ("a", "b"), gain(np.vstack([K.D, [[0.0]]]), DT), Injection.STATE, DT)
-    assert states[..., 1].min() < -1 < 1 < states[..., 1].max()  # it turns both ways
-    twice = np.repeat(states[..., :1], 2, axis=1), np.repeat(inputs, 2, axis=1)
-    tracked = track_parameter(o, *twice, {"phase": true + np.array([1.0, -1.0])}, settle_s=1.0)
-    np.testing.assert_allclose(
-        tracked.followed[4000:].mean(axis=0), true, atol=0.2
-    )  # the lag of the drive depends on speed, the phase takes it up
 
 
 def test_what_cannot_be_followed_is_refused():

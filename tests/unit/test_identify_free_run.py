@@ -36,18 +36,6 @@ def models(n_units=3, seed=0):
     )
 
 
-def test_an_exact_model_runs_free_without_error():
-    """The prediction at sample k is compared with the state at k: no shift by one sample."""
-    rng = np.random.default_rng(2)
-    A, B = np.array([[0.9, 0.1], [-0.2, 0.7]]), np.array([[0.0], [1.0]])
-    u = rng.normal(size=(1, 100, 1))
-    x = np.zeros((100, 2))
-    x[0] = [1.0, -1.0]
-    for k in range(99):
-        x[k + 1] = A @ x[k] + B @ u[0, k]
-    np.testing.assert_allclose(free_run(A, B, Lifting(("a", "b")), {}, x[:1], u)[0], x, atol=1e-13)
-
-
 def test_sizes_that_do_not_fit_are_named():
     with pytest.raises(DimensionError, match="do not fit a lifting of 2 states to 3"):
         free_run(np.eye(2), np.ones((2, 1)), LIFTING, {"phase": 0.0}, np.zeros((1, 2)), np.zeros((1, 5, 1)))

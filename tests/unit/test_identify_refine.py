@@ -9,7 +9,7 @@ from kros import from_arrays
 from kros.core import DataError
 from kros.data import Channel, EpisodeKey, Population, Role
 from kros.identify.refine import GaussNewton
-from kros.identify.refine.segments import Segments, held_segments, read_segments
+from kros.identify.refine.segments import read_segments
 
 
 def population(lengths: list[int]) -> tuple[Population, dict]:
@@ -19,39 +19,6 @@ def population(lengths: list[int]) -> tuple[Population, dict]:
         for e, n in enumerate(lengths)
     }
     return from_arrays(data, (Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0), {"u": tuple(data)}
-
-
-def test_segments_hold_the_last_episode_at_the_end() -> None:
-    made, keys = population([50, 50, 50, 50])
-    segments = read_segments(made, keys, horizon=10, count=8, seed=0)
-    episodes = segments.states[0, 0, 0] // 1000
-    assert held_segments(8, keys) == 2
-    np.testing.assert_array_equal(episodes, [0, 1, 2, 0, 1, 2, 3, 3])
-    np.testing.assert_array_equal(np.diff(segments.states[:, 0, 0], axis=0), 1.0)
-    np.testing.assert_array_equal(segments.inputs, -segments.states)
-
-
-def test_short_episodes_are_padded_and_marked() -> None:
-    made, keys = population([6, 50])
-    segments = read_segments(made, keys, horizon=10, count=2, seed=0)
-    np.testing.assert_array_equal(segments.valid[:, 0, 0], np.arange(11) < 6)
-    assert segments.valid[:, 0, 1].all()
-
-
-def test_segments_begin_with_the_history() -> None:
-    made, keys = population([50, 6])
-    segments = read_segments(made, keys, horizon=10, count=2, seed=0, history=3)
-    assert (segments.states.shape[0], segments.horizon, segments.compared.shape) == (14, 10, (10, 1, 2))
-    np.testing.assert_array_equal(np.diff(segments.states[:, 0, 0, 0]), 1.0)
-    np.testing.assert_array_equal(segments.compared[:, 0, 1], np.arange(10) < 2)  # six samples, four of them given
-    assert segments.first(1).history == segments.units(np.array([0])).history == 3
-
-
-def test_pieces_share_history_and_nothing_that_is_compared() -> None:
-    states = np.arange(22.0).reshape(22, 1, 1, 1).repeat(3, axis=3)
-    pieces = Segments(states, states, np.ones((22, 1, 3), bool), 2).cut(4)
-    np.testing.assert_array_equal(pieces.states[0, 0, 0], [0, 10, 15])  # of pieces from 0, 5, 10, 15 in every segment
-    assert (pieces.horizon, pieces.history) == (4, 2)
 
 
 def test_unit_without_training_episodes_is_named() -> None:

@@ -107,7 +107,7 @@ def grow(inner):
     )
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(
     text=st.recursive(LEAVES, grow, max_leaves=5),
     middle=st.tuples(*[st.floats(-3, 3)] * 3),
@@ -139,7 +139,7 @@ def test_no_sample_escapes(text, middle, half):
         assert np.all((found >= lower - slack) & (found <= upper + slack)), (text, expression)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     text=st.recursive(LEAVES, grow, max_leaves=4),
     middle=st.tuples(*[st.floats(-3, 3)] * 3),

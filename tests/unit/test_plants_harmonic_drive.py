@@ -21,36 +21,6 @@ def small():
     return SMALL.simulate()
 
 
-def test_population_has_the_form_of_the_reader(small):
-    population = small.population
-    assert population.unit_ids == ("000000", "001001", "001002", "001003")
-    assert [u.group for u in population.units] == ["outliers", "population", "population", "population"]
-    assert population.conditions == ("load", "noload")
-    assert population.states == ("position", "velocity", "current")
-    assert population.inputs == ("target_position", "target_velocity")
-    assert population.measured == ("position",)
-    assert len(population.episodes) == 16
-    assert population.sample_period_s == 1e-3
-    assert dict(population.metadata) == {"plant": "harmonic-drive", "gear_ratio": 100}
-    for key in population.episodes:
-        assert population.read(key).shape == (3000, 5)
-        assert small.raw.read(key).shape == (4001, 5)
-
-
-def test_rest_is_at_rest_and_calibrates_the_offset(small):
-    for key in small.population.episodes:
-        raw, prepared = small.raw.read(key), small.population.read(key)
-        assert np.ptp(raw[:1000, 3]) == 0
-        assert not np.any(raw[:1000, 4])
-        assert np.ptp(raw[:1000, 0]) < 1e-5
-        offset = np.mean(raw[:1000, 0] - raw[:1000, 3])
-        np.testing.assert_allclose(raw[1000:-1, 0] - prepared[:, 0], offset, atol=2e-6)
-        assert abs(prepared[0, 0] - prepared[0, 3]) < 1e-5
-        assert abs(offset) < 0.021
-    offsets = {round(float(small.raw.read(k)[0, 0] - small.raw.read(k)[0, 3]), 6) for k in small.raw.episodes}
-    assert len(offsets) == len(small.raw.episodes)
-
-
 def test_a_unit_is_the_same_whatever_else_is_simulated(small):
     alone = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=3.0, seed=4, conditions=("load",)).simulate()
     np.testing.assert_allclose(alone.population.read(LOADED), small.population.read(LOADED), atol=1e-9)

@@ -136,7 +136,7 @@ def test_units_that_were_not_recorded_where_it_counts_are_named(
 def test_a_run_takes_models_that_are_identified(
     population: Population, uncertain: UncertainModels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tables = {"until": "quantify"}
+    tables = {"until": "quantify", "uncertainty": {"n_freqs": 60}}
     alone = kros.run(population, tmp_path / "alone", identify={"refine": False}, **tables)
     with monkeypatch.context() as patch:
         patch.setattr("kros.study.stages.learning.with_models", None)

@@ -36,20 +36,18 @@ def die(_: int) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_results_come_in_order(workers):
+def test_results_come_in_order_and_warnings_about_numbers_are_errors(workers):
     with open_executor(workers) as executor:
         assert list(executor.map(square, range(5))) == [0, 1, 4, 9, 16]
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_work_that_was_begun_comes_in_order_where_it_is_wanted(workers):
-    with open_executor(workers) as executor:
         work = Work(executor)
         results, wrong = work.begin("first", (partial(square, x) for x in range(5))), work.begin("wrong", [refuse])
         assert work.run("meanwhile", [partial(square, 9)]) == [81]
         assert results() == [0, 1, 4, 9, 16]
         with pytest.raises(KrosError, match="as it should"):
             wrong()
+        assert list(executor.map(overflow, [1.0])) == [1e300]
+        with pytest.raises(RuntimeWarning, match="overflow"):
+            list(executor.map(overflow, [1.0, 1e300]))
 
 
 def test_work_that_is_abandoned_is_not_waited_for():
@@ -63,10 +61,3 @@ def test_work_that_is_abandoned_is_not_waited_for():
 def test_a_worker_that_is_ended_from_outside_is_an_error_with_a_remedy():
     with pytest.raises(KrosError, match="fewer workers"), open_executor(2) as executor:
         list(executor.map(die, range(3)))
-
-
-def test_a_warning_about_numbers_is_an_error_in_worker_processes_too() -> None:
-    with open_executor(2) as executor:
-        assert list(executor.map(overflow, [1.0])) == [1e300]
-        with pytest.raises(RuntimeWarning, match="overflow"):
-            list(executor.map(overflow, [1.0, 1e300]))

@@ -27,7 +27,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
     facts = RecordingFacts("noload", dict.fromkeys(population.unit_ids, "population"), train, test, {})
     return SimpleNamespace(
         config=SimpleNamespace(
-            load=LoadConfig(**options), estimator=EstimatorSettings(rows=6000, sample=2000, folds=2, parts=2)
+            load=LoadConfig(**options), estimator=EstimatorSettings(rows=3000, sample=1000, folds=2, parts=2)
         ),
         facts=facts,
         population=population,

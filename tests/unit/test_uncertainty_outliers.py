@@ -9,25 +9,13 @@ import pytest
 from drives import drives
 
 from kros.core.errors import ConfigError, DataError, DimensionError
-from kros.uncertainty import Form, OutlierModel, score_outliers
+from kros.uncertainty import OutlierModel, score_outliers
 
 FREQS = np.geomspace(5e-3, 500.0, 150)
 
 
 def responses(n_units: int, seed: int, outlier: bool = False) -> np.ndarray:
     return drives(n_units, seed, outlier).frequency_response(FREQS)
-
-
-@pytest.mark.parametrize("form", [Form.ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE])
-def test_planted_outlier_has_the_top_score_and_false_alarms_are_rare(form: Form) -> None:
-    false_alarms = 0
-    for seed in range(5):
-        model = score_outliers(responses(13, seed, outlier=True), FREQS, form)
-        scores = [s.score_db for s in model.scores]
-        assert int(np.argmax(scores)) == 12
-        assert model.scores[12].outlier
-        false_alarms += sum(s.outlier for s in model.scores[:12])
-    assert false_alarms <= 1
 
 
 def test_flagged_units_are_left_out_of_the_model() -> None:

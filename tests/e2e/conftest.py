@@ -7,17 +7,38 @@ import os
 import runpy
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
+from kros.design.methods import METHODS
+from kros.design.methods.robust import Published, WorstCaseH2
 from kros.report.figures import Drawn, draw
 from kros.report.run_folder import RunFolder
+from kros.uncertainty.settings import SET, QuantifySettings
 
 # An estimator that learns from less: the keys of [estimator].
-QUICK = "rows = 6000\nsample = 2000\nfolds = 2\nparts = 2\ngap_episodes = 4\ngap_samples = 12000\npenalties = [1e-12, 1e-8, 1e-4]\n"
+QUICK = "rows = 4000\nsample = 1500\nfolds = 2\nparts = 2\ngap_episodes = 4\ngap_samples = 12000\npenalties = [1e-12, 1e-8, 1e-4]\n"
+
+
+@contextmanager
+def low_orders() -> Iterator[None]:
+    """Weights of low orders in studies that are about something else: fits take longest, and `tests/oracle` has them."""
+
+    class First(QuantifySettings):
+        max_order: int = 1
+
+    methods = [replace(m, max_order=1) if isinstance(m, Published | WorstCaseH2) else m for m in METHODS]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(import_module("kros.uncertainty.quantify"), "QuantifySettings", First)
+        patch.setattr(import_module("kros.uncertainty.unit_residuals"), "SET", replace(SET, entry_order=1))
+        patch.setattr("kros.design.methods.METHODS", tuple(methods))
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -46,7 +67,7 @@ def recorded(kros, tmp_path_factory) -> Path:
 def demo(kros, recorded, tmp_path_factory) -> Path:
     """A finished study, with fewer rows and points."""
     folder = tmp_path_factory.mktemp("demo")
-    quick = f"[estimator]\n{QUICK}[uncertainty]\nn_freqs = 300\n"
+    quick = f'[estimator]\n{QUICK}[uncertainty]\nn_freqs = 100\n[synthesis]\nmethods = ["worst_case_h2", "estimator"]\n'
     (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{quick}')
     result = kros("run", folder / "demo.toml", "--out", folder / "run")
     assert result.exit_code == 0, result.output
@@ -57,11 +78,12 @@ def demo(kros, recorded, tmp_path_factory) -> Path:
 def paper(kros, recorded, tmp_path_factory) -> Path:
     """A study of the same recordings with the paper's models and observers."""
     folder = tmp_path_factory.mktemp("paper")
-    few = '[synthesis]\nmethods = ["mixed", "paper"]\n[observer]\nbaselines = ["open_loop"]\n[uncertainty]\nn_freqs = 300\n'
+    few = '[synthesis]\nmethods = ["mixed", "paper"]\n[observer]\nbaselines = ["open_loop"]\n[uncertainty]\nn_freqs = 60\n'
     (folder / "paper.toml").write_text(
         f'[data]\nsource = "{recorded}"\nreader = "parquet"\n[identify]\nrefine = false\n{few}'
     )
-    result = kros("run", folder / "paper.toml", "--out", folder / "run")
+    with low_orders():
+        result = kros("run", folder / "paper.toml", "--out", folder / "run")
     assert result.exit_code == 0, result.output
     return folder / "run"
 
@@ -70,6 +92,13 @@ def paper(kros, recorded, tmp_path_factory) -> Path:
 def metrics(demo) -> dict[str, Any]:
     """The demo's machine-readable result."""
     return json.loads((demo / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def low_order_weights() -> Iterator[None]:
+    """Weights of low orders in all studies of a file."""
+    with low_orders():
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from kros.core import ConfigError
 from kros.data import Channel, Role, from_arrays, write_parquet
 from kros.study import RunResult
 
+pytestmark = pytest.mark.usefixtures("low_order_weights")
 PERIOD_S = 0.01
 CHANNELS = (
     Channel("position", Role.STATE, "rad", True),

@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from kros.core import DataError
@@ -121,34 +120,6 @@ def test_a_second_run_changes_nothing_and_skips_everything(kros, demo, metrics):
     assert {p: p.stat().st_mtime_ns for p in before} == before
     again = json.loads((demo / "metrics.json").read_text())
     assert {k: v for k, v in again.items() if k != "timing_s"} == {k: v for k, v in metrics.items() if k != "timing_s"}
-
-
-def test_estimates_are_written_one_row_group_an_episode(kros, demo, tmp_path, metrics, recorded):
-    out = tmp_path / "estimates.parquet"
-    result = kros("estimate", demo, recorded, out)
-    assert result.exit_code == 0, result.output
-    file = pq.ParquetFile(out)
-    assert file.num_row_groups == 6 * 2 * 4
-    table = file.read()
-    states = ["position", "velocity", "current"]
-    recorded_too = [*states, "target_position", "target_velocity"]
-    written = [f"{state}_{what}" for what in ("hat", "band") for state in states]
-    assert table.column_names == ["unit", "condition", "episode", "k", "time_s", "status", *recorded_too, *written]
-    rows = table.to_pandas()
-    one = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == "3")]
-    from kros.data import EpisodeKey
-    from kros.data.readers.parquet import read_parquet
-
-    truth = read_parquet(recorded).read(EpisodeKey("001002", "noload", "3"))
-    error = 100 * np.sqrt(np.mean((one["velocity_hat"].to_numpy() - truth[:, 1]) ** 2)) / np.abs(truth[:, 1]).max()
-    expected = [
-        r["error_percent"]
-        for r in metrics["evaluation"]
-        if (r["observer"], r["unit"], r["condition"], r["channel"])
-        == (metrics["study"]["deployed"], "001002", "noload", "velocity")
-    ]
-    assert error == pytest.approx(expected[0], rel=1e-9)
-    assert kros("estimate", demo, recorded, out).exit_code == 2
 
 
 @pytest.mark.parametrize("command", ["c", "fmu"])

@@ -13,7 +13,7 @@ FAST = (
 )
 
 
-def test_the_demo_command_runs_everything_and_says_where_the_report_is(kros, few_figures, tmp_path):
+def test_the_demo_command_runs_everything_and_says_where_the_report_is(kros, few_figures, low_order_weights, tmp_path):
     out = tmp_path / "demo"
     size = ("--units", 3, "--episodes", 2, "--seconds", 5)
     options = ["--out", out, *size, *(part for key in FAST for part in ("--set", key))]

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-pytestmark = pytest.mark.usefixtures("few_figures")
+pytestmark = pytest.mark.usefixtures("few_figures", "low_order_weights")
 # EDMD models and one method, at few frequencies: the rest is most of the time, and tests of other studies do it.
 QUICK = ["identify.refine=false", 'synthesis.methods=["residual_h2"]', "uncertainty.n_freqs=50"]
 QUICK += ['observer.baselines=["open_loop"]']
@@ -16,13 +16,13 @@ def set_to(*settings: str) -> list[str]:
 
 def test_double_pendulum(example, recordings, tmp_path):
     out = tmp_path / "run"
-    example("double_pendulum/run.py", "--out", out, "--workers", 1, *set_to(*QUICK), data=recordings)
+    options = ("--out", out, "--workers", 1, "--until", "evaluate", *set_to(*QUICK))
+    example("double_pendulum/run.py", *options, data=recordings)
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["study"]["units"] == 6
     assert metrics["study"]["sample_period_s"] == 0.0025
     assert {u["status"] for u in metrics["units"]} == {"ok"}
     assert {r["channel"] for r in metrics["evaluation"]} == {"position", "velocity", "torque"}
-    assert (out / "report.html").stat().st_size > 10_000
 
 
 def test_one_model_a_double_pendulum_predicts_better_than_linear_models(example, recordings):

@@ -107,6 +107,8 @@ def test_csv_and_parquet_say_the_same_with_units_and_sources(kros, demo, field, 
         result = kros("estimate", demo, data, tmp_path / out, "--plot", tmp_path / "x.png")
         assert result.exit_code == 0, result.output
         assert result.output.count("parameters calibrated on the derivative of position") == 3
+    assert pq.ParquetFile(tmp_path / "x.parquet").num_row_groups == len(machines.episodes)
+    assert kros("estimate", demo, data, tmp_path / "x.csv").exit_code == 2  # it is there
     names, values = table(tmp_path / "x.csv")
     found = pq.read_table(tmp_path / "x.parquet")
     states = {"position": "rad", "velocity": "rad/s", "current": "1"}
@@ -152,19 +154,18 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
     result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "x.csv")
     assert result.exit_code == 1
     assert "--track phase" in result.stderr
-    result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "x.csv", "--track", "phase")
+    options = ("--track", "phase", "--parameter", "m000000.phase=1.2")
+    result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "x.csv", *options)
     assert result.exit_code == 0, result.output
-    assert result.output.count("parameters tracked from the value of the smallest innovation") == 3
+    assert result.output.count("that is given") == 1
+    assert result.output.count("parameters tracked from the value of the smallest innovation") == 2
     names, values = table(tmp_path / "x.csv")
     assert names[-1] == "phase [rad]"
     facts = json.loads((tmp_path / "x.csv-metadata.json").read_text())
     assert facts["columns"]["phase"] == "rad"
-    for unit, own in facts["parameters"].items():
-        apart = np.angle(np.exp(1j * (own["phase"] - calibrated[unit]["phase"])))
+    for unit in ("m001001", "m001002"):
+        apart = np.angle(np.exp(1j * (facts["parameters"][unit]["phase"] - calibrated[unit]["phase"])))
         assert abs(apart) < 0.6  # motion in one direction cannot tell a phase from a lag
-    options = ("--track", "phase", "--parameter", "m001001.phase=1.2")
-    result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "y.csv", *options)
-    assert result.output.count("that is given") == 1
     assert np.isfinite(values).all()
 
 
@@ -242,7 +243,8 @@ def test_a_controller_over_the_demo_is_judged(kros, demo, tmp_path, gain, code, 
     assert said["status"] == word
     assert code or all(radius < 1 for radius in said["spectral_radius"].values())
     assert code or 1 < said["margin"] <= said["destabilising"]
-    assert kros(*command).stdout.startswith(f"{word}: ")
+    if code:
+        assert kros(*command).stdout.startswith(f"{word}: ")
     for changed in (content | {"poles": 1}, content | {"inputs": ["speed"]}, content | {"D": [[gain, 0.0]]}):
         file.write_text(json.dumps(changed))
         assert kros("loop", demo, "--controller", file).exit_code == 2

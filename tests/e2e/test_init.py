@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kros.data import EpisodeKey, Population
-from kros.plants import DcMotorPopulation, PendulumPopulation
+from kros.plants import DcMotorPopulation
 from kros.study import load_config
 from kros.study.stages.learning import open_source
 
@@ -182,27 +182,6 @@ def test_headers_twice_times_rounded_and_lines_behind_the_numbers(kros, tmp_path
     assert kros("init", rounded, "--out", tmp_path / "rounded.toml", "--period", motors.sample_period_s).exit_code == 0
     ended = folder("ended", "time,position,velocity,current,u", 6, "End of file\n")
     assert "Expected 5 columns, got 1: End of file" in kros("init", ended, "--out", tmp_path / "ended.toml").output
-
-
-def test_one_recording_a_unit_is_cut_into_episodes(kros, tmp_path):
-    pendulums = PendulumPopulation(n_units=3, n_episodes=1, seconds=15, seed=1).simulate().population
-    folder = tmp_path / "recordings"
-    folder.mkdir()
-    for key in pendulums.episodes:
-        t = pendulums.sample_period_s * np.arange(len(pendulums.read(key)))
-        rows = np.column_stack([t, pendulums.read(key)])
-        np.savetxt(
-            folder / f"{key.unit}.csv", rows, delimiter=",", header="t,angle,rate,torque_cmd", comments="", fmt="%.10g"
-        )
-    result = kros("init", folder, "--out", tmp_path / "study.toml")
-    assert result.exit_code == 2
-    assert r"--files '^(?P<unit>\d+)\.csv$'" in result.stderr  # or episodes of one unit: the names do not say
-    result = kros("init", folder, "--out", tmp_path / "study.toml", "--files", r"^(?P<unit>\d+)\.csv$")
-    assert result.exit_code == 0, result.output
-    found = open_source(load_config(tmp_path / "study.toml"))
-    assert [len(keys) for _, _, keys in found.groups()] == [5] * 3
-    whole = np.concatenate([found.read(k) for k in found.keys(found.unit_ids[0])])
-    np.testing.assert_allclose(whole, pendulums.read(pendulums.episodes[0]), rtol=1e-8, atol=1e-9)
 
 
 def test_single_samples_without_a_value_cost_no_episode(kros, tmp_path, motors):

@@ -22,6 +22,7 @@ from kros.study.engine.context import Context
 from kros.study.engine.store import Store
 from kros.study.stages.left_out import without
 
+pytestmark = pytest.mark.usefixtures("low_order_weights")
 UNITS = ("001", "002", "003", "004")
 FAST = (
     '[data]\nsource = "{source}"\nreader = "parquet"\n'
@@ -130,15 +131,6 @@ def test_folds_that_cannot_be_made_are_refused_at_once(kros, pendulums, tmp_path
     assert result.exit_code == 2
     assert told in result.stderr
     assert not (tmp_path / "run").exists()
-
-
-def test_an_excluded_unit_is_nowhere(pendulums, tmp_path):
-    path = study(tmp_path, pendulums)
-    result = run_study(load_config(path, ['data.exclude=["002"]']), tmp_path / "run", until=Stage.IDENTIFY)
-    assert [row["unit"] for row in result.metrics["units"]] == ["001", "003", "004"]
-    written = [p for part in ("population", "factors", "models") for p in (tmp_path / "run" / part).rglob("*.json")]
-    assert len(written) >= 3
-    assert not [p for p in written if '"002"' in p.read_text()]
 
 
 def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):

@@ -6,7 +6,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from kros.data import Channel, Role, from_arrays, write_parquet
 from kros.identify import ModelSet
 from kros.observer import Observer
 
@@ -44,7 +43,7 @@ INPUT_FUNCTIONS = ("current[-1]*target_velocity",)
 
 
 @pytest.fixture(scope="module")
-def run(kros, tmp_path_factory):
+def run(kros, low_order_weights, tmp_path_factory):
     """A finished study of a lifting with everything in it, beside its recordings of three drives."""
     folder = tmp_path_factory.mktemp("lifting")
     assert kros("simulate", folder / "drives", "--units", 3, "--episodes", 3, "--seconds", 5).exit_code == 0
@@ -82,37 +81,3 @@ def test_observers_run_with_it(run, kros, tmp_path):
     assert len(pq.read_table(tmp_path / "estimates.parquet")) > 0
     result = kros("check", run, run.parent / "drives")
     assert result.exit_code == 4, result.output  # of three units none can be told from the others
-
-
-def machines(n_samples):
-    """Recordings of three linear machines, an episode of given length each time."""
-    rng = np.random.default_rng(0)
-    channels = [
-        Channel("x", Role.STATE, "m", True),
-        Channel("v", Role.STATE, "m/s"),
-        Channel("u", Role.INPUT, "N"),
-        Channel("w", Role.INPUT, "N"),
-    ]
-    data = {}
-    for unit in "123":
-        data[unit] = []
-        for length in n_samples:
-            u = rng.normal(size=(length, 2))
-            x = np.zeros((length, 2))
-            for k in range(length - 1):
-                x[k + 1] = [0.9 * x[k, 0] + 0.1 * x[k, 1], 0.8 * x[k, 1] + u[k].sum() * (1 + 0.1 * int(unit))]
-            data[unit].append(np.hstack([x, u]))
-    return from_arrays(data, channels, 0.01)
-
-
-def test_models_with_delays_and_input_functions_are_refined(study, kros, tmp_path):
-    write_parquet(machines([150, 150, 150]), tmp_path / "data")
-    extra = "[lifting]\nfunctions = ['tanh(v)', 'x[-2]']\ninput_functions = ['v*u']"
-    result = kros("run", study(extra, source=tmp_path / "data"), "--out", tmp_path / "run", "--until", "identify")
-    assert result.exit_code == 0, result.output
-    models, linear = (ModelSet.load(tmp_path / "run" / "models" / name) for name in ("koopman", "linear"))
-    assert (models.lifting.history, models.inputs) == (2, ("u", "w", "v*u"))
-    assert (models.A.shape, models.B.shape, linear.B.shape) == ((3, 4, 4), (3, 4, 3), (3, 2, 2))
-    truth = np.array([[[0.9, 0.1, 0, 0], [0, 0.8, 1 + 0.1 * unit, 1 + 0.1 * unit]] for unit in (1, 2, 3)])
-    found = np.concatenate([models.A[:, :2, :2], models.B[:, :2, :2]], axis=2)
-    np.testing.assert_allclose(found, truth, atol=0.03)  # the prior draws units together whose gains differ by a tenth

@@ -15,20 +15,15 @@ UNITS, EPISODES, SECONDS = 4, 5, 10
 
 
 @pytest.fixture(scope="module")
-def pendulums(kros, few_figures, tmp_path_factory):
-    """A finished study of simulated pendulums with refined models."""
+def pendulums(kros, tmp_path_factory):
+    """A study of simulated pendulums up to its refined models."""
     folder = tmp_path_factory.mktemp("pendulums")
     options = ("--units", UNITS, "--episodes", EPISODES, "--seconds", SECONDS)
     assert kros("simulate", folder / "recordings", "--plant", "pendulum", *options).exit_code == 0
     (folder / "study.toml").write_text(
-        '[data]\nsource = "recordings"\nreader = "parquet"\n'
-        '[lifting]\nfunctions = ["sin(position)"]\n'
-        "[identify]\nrefine = true\n"
-        "[uncertainty]\nn_freqs = 80\n"
-        '[synthesis]\nmethods = ["worst_case_h2"]\n'
-        '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
+        '[data]\nsource = "recordings"\nreader = "parquet"\n[lifting]\nfunctions = ["sin(position)"]\n'
     )
-    result = kros("run", folder / "study.toml", "--out", folder / "run")
+    result = kros("run", folder / "study.toml", "--out", folder / "run", "--until", "identify")
     assert result.exit_code == 0, result.output
     return folder
 
@@ -60,17 +55,6 @@ def percent_from_truth(models: ModelSet, population: Population, truths: dict[st
         run = free_run(models.A[i], models.B[i], models.lifting, {}, truth[None, 0], u[None])[0]
         rows.append(100 * np.sqrt(np.mean((run - truth) ** 2, axis=0)) / np.abs(truth).max(axis=0))
     return np.array(rows)
-
-
-def test_the_study_of_pendulums_ends_with_robust_observers(pendulums):
-    metrics = json.loads((pendulums / "run" / "metrics.json").read_text())
-    assert list(metrics["models"]) == ["koopman", "linear"]
-    for name in ("koopman", "linear"):
-        observer = metrics["observers"][f"{name}/worst_case_h2"]
-        assert 0 < observer["lower_bound"] <= observer["worst_case_h2"]
-        assert observer["spectral_radius_max"] < 1
-    assert {r["channel"] for r in metrics["evaluation"]} == {"position", "velocity"}
-    assert (pendulums / "run" / "report.html").stat().st_size > 10_000
 
 
 def test_refined_models_are_close_to_the_pendulums_themselves(pendulums):

@@ -9,8 +9,6 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
-
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
 # the study of the page takes a minute; what it does is the same
 QUICKER = ["identify.refine=false", 'synthesis.methods=["worst_case_h2"]', 'observer.baselines=["open_loop"]']
@@ -27,7 +25,7 @@ def steps() -> list[tuple[str, str]]:
     return found
 
 
-def test_the_tutorial_from_csv_to_a_board(kros, few_figures, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tutorial_from_csv_to_a_board(kros, few_figures, low_order_weights, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     done = []
     for language, text in steps():

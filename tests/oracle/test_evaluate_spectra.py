@@ -1,15 +1,10 @@
-"""Estimates that diverge spoil no other spectrum; observers that share a model share a run."""
+"""Estimates that diverge spoil no other spectrum."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
 from kros.evaluate.errors import errors_of
-from kros.evaluate.held_out import alike
-from kros.lifting import Lifting
-from kros.observer import Observer
 
 DT = 1e-3
 
@@ -24,11 +19,3 @@ def test_a_diverged_estimate_spoils_no_other_spectrum() -> None:
     np.testing.assert_allclose(both[1:], alone, rtol=1e-12)
 
 
-def test_observers_of_one_model_share_a_run() -> None:
-    lifting = Lifting(("x", "v"))
-    first = Observer.open_loop("a", lifting, np.eye(2), np.ones((2, 1)), (0,), ("u",), DT)
-    names = [
-        [o.name for o in g] for g in alike([first, replace(first, name="b", measured=(1,)), replace(first, name="c")])
-    ]
-    assert names == [["a", "c"], ["b"]]
-    assert [len(g) for g in alike([first] * 20)] == [8, 8, 4]

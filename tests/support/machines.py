@@ -46,14 +46,10 @@ MACHINES = {
     "lifted": lambda: drive(),
     "gain": lambda: drive(order=0),
     "linear": lambda: drive(()),
-    "delay": lambda: drive(delay=3),
     "limits": lambda: drive(**LIMITS),
-    "delay and limits": lambda: drive(delay=2, **LIMITS),
-    "start": lambda: drive(start=START),
     "limits, delay and start": lambda: drive(delay=2, start=START, **LIMITS),
     "through the input": lambda: drive(injection=Injection.INPUT),
     "every function": lambda: drive(SMOOTH),
-    "earlier values": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate")),
     "earlier values and delay": lambda: drive(
         ("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate"), delay=3
     ),

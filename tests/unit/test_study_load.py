@@ -44,33 +44,23 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
     )
 
 
-def test_a_declared_load_is_found_on_the_other_units(tmp_path: Path) -> None:
+def test_a_declared_load_is_found_on_the_other_units_with_the_parameters_of_the_nominal_one(tmp_path: Path) -> None:
     study = context(tmp_path, moment=0.2, inertia=0.01, units=("001002",))
-    run_load(study, {})
-    told = load_metrics(study)["load_torque"]
-    assert told["known"] == ["001002"]
-    (row,) = told["rows"]
-    assert row["observer"] == "linear/load"
-    assert row["error_to_floor"] == pytest.approx(row["error_rms"] / row["floor_rms"])
-    assert 0 < row["error_rms"] < row["load_rms"]
-    made = Observer.load(tmp_path / "load" / "linear.json")
-    assert made.lifting.states[3] == "load"
-    assert made.seen is not None
-    assert (
-        "linear/load"
-        in load_torque(
-            SimpleNamespace(folder=tmp_path, sample_period_s=1e-3, has=lambda name: (tmp_path / name).exists())
-        )[1]
-    )
-
-
-def test_an_observer_of_the_load_runs_with_the_parameters_of_the_nominal_unit(tmp_path: Path) -> None:
-    study = context(tmp_path, moment=0.2, units=("001002",))
     study.lifting = Lifting(POPULATION.states, ("sin(100*position + phase)",), ("phase",))
     study.identified.parameters = {unit: {"phase": 0.5 + i} for i, unit in enumerate(POPULATION.unit_ids)}
     run_load(study, {})
-    assert Observer.load(tmp_path / "load" / "koopman.json").parameters == {"phase": 0.5}
-    assert Observer.load(tmp_path / "load" / "linear.json").parameters == {}
+    told = load_metrics(study)["load_torque"]
+    assert told["known"] == ["001002"]
+    assert [row["observer"] for row in told["rows"]] == ["koopman/load", "linear/load"]
+    for row in told["rows"]:
+        assert row["error_to_floor"] == pytest.approx(row["error_rms"] / row["floor_rms"])
+        assert 0 < row["error_rms"] < row["load_rms"]
+    koopman, linear = (Observer.load(tmp_path / "load" / f"{kind}.json") for kind in ("koopman", "linear"))
+    assert linear.lifting.states[3] == "load"
+    assert linear.seen is not None
+    assert (koopman.parameters, linear.parameters) == ({"phase": 0.5}, {})
+    run = SimpleNamespace(folder=tmp_path, sample_period_s=1e-3, has=lambda name: (tmp_path / name).exists())
+    assert "linear/load" in load_torque(run)[1]
 
 
 def test_without_a_moment_nothing_is_done(tmp_path: Path) -> None:

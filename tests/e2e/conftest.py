@@ -23,7 +23,19 @@ from kros.report.run_folder import RunFolder
 from kros.uncertainty.settings import SET, QuantifySettings
 
 # An estimator that learns from less: the keys of [estimator].
-QUICK = "rows = 4000\nsample = 1500\nfolds = 2\nparts = 2\ngap_episodes = 4\ngap_samples = 12000\npenalties = [1e-12, 1e-8, 1e-4]\n"
+QUICK = """
+rows = 4000
+episodes = 16
+sample = 1500
+sample_episodes = 8
+restarts = 2
+features = 8
+folds = 2
+parts = 2
+gap_episodes = 4
+gap_samples = 12000
+penalties = [1e-12, 1e-8, 1e-4]
+"""
 
 
 @contextmanager

@@ -14,17 +14,6 @@ def set_to(*settings: str) -> list[str]:
     return [part for setting in settings for part in ("--set", setting)]
 
 
-def test_double_pendulum(example, recordings, tmp_path):
-    out = tmp_path / "run"
-    options = ("--out", out, "--workers", 1, "--until", "evaluate", *set_to(*QUICK))
-    example("double_pendulum/run.py", *options, data=recordings)
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["study"]["units"] == 6
-    assert metrics["study"]["sample_period_s"] == 0.0025
-    assert {u["status"] for u in metrics["units"]} == {"ok"}
-    assert {r["channel"] for r in metrics["evaluation"]} == {"position", "velocity", "torque"}
-
-
 def test_one_model_a_double_pendulum_predicts_better_than_linear_models(example, recordings):
     ahead = json.loads(example("double_pendulum/builds.py", "--json", data=recordings))
     upto, last = ahead["all samples up to 0.2 s"], ahead["the sample at 0.2 s"]
@@ -65,6 +54,12 @@ def test_a_drive_that_was_left_out_is_estimated_as_well_as_by_a_regression(examp
 @pytest.mark.parametrize(
     ("name", "options", "size", "orders"),
     [
+        (
+            "double_pendulum",
+            ["--until", "identify", *set_to("identify.refine=false")],
+            (6, 0.0025),
+            {"koopman_edmd": 5, "linear_edmd": 3},
+        ),
         ("quanser_qube", set_to("identify.refine=false"), (1, 0.002), {"koopman_edmd": 6, "linear_edmd": 4}),
         (
             "pneumatic",

@@ -17,5 +17,3 @@ def test_a_diverged_estimate_spoils_no_other_spectrum() -> None:
     both = errors_of(estimate, truth, np.array([2000, 2000]), DT, band)["gearbox_band_power"]
     assert not np.isfinite(both[0]).any()
     np.testing.assert_allclose(both[1:], alone, rtol=1e-12)
-
-

@@ -14,8 +14,7 @@ from kros.loops.compiler import find_compiler
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")
-@pytest.mark.parametrize("fmi", [2, 3])
-@pytest.mark.parametrize(("from_source", "track"), [(False, None), (True, "phase")])
+@pytest.mark.parametrize(("fmi", "from_source", "track"), [(2, True, "phase"), (3, False, None)])
 def test_two_instances_at_once_and_after_a_reset(fmi, from_source, track, tmp_path):
     fmpy = pytest.importorskip("fmpy", reason="FMPy (the extra fmu) is not installed")
     from fmpy import fmi2, fmi3

@@ -87,17 +87,6 @@ def test_python_of_pages_is_run(path: Path) -> None:
     assert path.name == "tutorial.md" or [block for block in python if not block.startswith(">>> ")] == []
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
-def test_configurations_of_documents_are_valid(path: Path) -> None:
-    for block in blocks(path.read_text(encoding="utf-8"), "toml"):
-        check_configuration(block)
-
-
-@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
-def test_names_in_documents_exist(path: Path) -> None:
-    assert unknown_names(path.read_text(encoding="utf-8")) == []
-
-
 def command(names: list[str]) -> Any:
     """The command that a line begins with; None if it does not exist."""
     command: Any = typer.main.get_command(app)
@@ -128,22 +117,17 @@ def unknown_commands(text: str) -> list[str]:
     return unknown
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
-def test_commands_in_documents_exist(path: Path) -> None:
-    assert unknown_commands(path.read_text(encoding="utf-8")) == []
+def unknown_functions(text: str) -> set[str]:
+    """Functions of C that a document calls and that are not generated."""
+    header = (ROOT / "src/kros/export/c99/templates/observer.h.jinja").read_text(encoding="utf-8")
+    declared = set(re.findall(r"\{\{ name \}\}_(\w+?)(?:\{\{ \w+ \}\})?\(", header))
+    called = set(re.findall(r"\baxis_(\w+)\(", "\n".join(blocks(text, "c"))))
+    return {name for name in called if name not in declared and name.rpartition("_")[0] + "_" not in declared}
 
 
 def test_unknown_commands_are_found() -> None:
     text = "```console\n$ kros runs study.toml\n$ .venv/bin/kros run study.toml --set a.b=1  # why\n$ kros check a b --jsn\n```\n"
     assert unknown_commands(text) == ["runs study.toml", "check a b --jsn"]
-
-
-@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
-def test_functions_in_c_of_documents_are_generated(path: Path) -> None:
-    header = (ROOT / "src/kros/export/c99/templates/observer.h.jinja").read_text(encoding="utf-8")
-    declared = set(re.findall(r"\{\{ name \}\}_(\w+?)(?:\{\{ \w+ \}\})?\(", header))
-    called = set(re.findall(r"\baxis_(\w+)\(", "\n".join(blocks(path.read_text(encoding="utf-8"), "c"))))
-    assert {name for name in called if name not in declared and name.rpartition("_")[0] + "_" not in declared} == set()
 
 
 def test_an_unknown_key_is_found() -> None:
@@ -320,9 +304,15 @@ def broken_links(path: Path, text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
-def test_no_link_is_broken(path: Path) -> None:
-    """Sphinx looks at docs/ alone."""
-    assert broken_links(path, path.read_text(encoding="utf-8")) == []
+def test_what_documents_name_exists(path: Path) -> None:
+    """Keys, names, commands, functions in C and links; Sphinx looks at links of docs/ alone."""
+    text = path.read_text(encoding="utf-8")
+    for block in blocks(text, "toml"):
+        check_configuration(block)
+    assert unknown_names(text) == []
+    assert unknown_commands(text) == []
+    assert unknown_functions(text) == set()
+    assert broken_links(path, text) == []
 
 
 def test_broken_links_are_found() -> None:

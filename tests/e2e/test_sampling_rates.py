@@ -15,7 +15,9 @@ from kros.study.config import Stage
 
 pytestmark = pytest.mark.usefixtures("low_order_weights")
 PERIODS_S = (10.0, 5e-5)
-QUICK = ["uncertainty.n_freqs=100", "estimator.rows=2000"]  # neither knows of seconds
+# Less of everything that takes long; none of it knows of seconds.
+QUICK = ["uncertainty.n_freqs=100", "estimator.rows=2000", "estimator.episodes=16", "estimator.sample_episodes=8"]
+QUICK += ["estimator.restarts=2", "estimator.features=8"]
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from kros.data import prepare
 from kros.data.prepare import scale_population
 from kros.data.recording import check_episode, is_constant
 from kros.data.steps import Step
-from kros.identify import Factor, PhaseSpec, combine, edmd, smallest_stabilising_alpha
+from kros.identify import Factor, PhaseSpec, combine, edmd
 from kros.identify.calibration import find_segments
 from kros.identify.factors import Ranges, lifted_factor, reduce_episode, require_excitation
 from kros.identify.refine import RefineOptions, refine_population
@@ -69,21 +69,6 @@ def factor_of(population, lifting):
 def sizes_of(factors):
     """What the matrices' rows and columns are multiplied by; the lifted function is a pure number."""
     return np.array([factors.get(n, 1.0) for n in CHANNELS[:3]] + [1.0]), np.array([factors.get("voltage", 1.0)])
-
-
-@pytest.mark.parametrize("factors", SCALINGS, ids=str)
-def test_edmd_with_a_searched_alpha_gives_the_same_models(motors, factors):
-    found = []
-    for own in ({}, factors):
-        factor = factor_of(in_units(motors, own), lifting_of(own))
-        ranges = Ranges.of(factor, 4)
-        alpha = 4 * smallest_stabilising_alpha([(ranges.triangles(factor.R), 4)])
-        found.append((alpha, ranges.edmd(factor.R, alpha)))
-    x, u = sizes_of(factors)
-    (alpha, one), (other_alpha, other) = found
-    assert other_alpha == pytest.approx(alpha, rel=1e-6)
-    np.testing.assert_allclose(other.A * x / x[:, None], one.A, atol=1e-9 * np.abs(one.A).max())
-    np.testing.assert_allclose(other.B * u / x[:, None], one.B, rtol=1e-6)
 
 
 def test_in_the_units_of_the_recordings_alpha_is_the_papers(motors):

@@ -13,7 +13,7 @@ from kros.design.synthesize import measurement_noise
 from kros.evaluate.sensor import as_arriving, as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Sensor
-from kros.observer.sensor import in_units, require_measured
+from kros.observer.sensor import require_measured
 from kros.observer.simulate import run_observers
 from kros.observer.units import in_sizes
 from kros.study.config import validate_config
@@ -77,18 +77,6 @@ def test_draws_belong_to_an_episode():
     assert np.isfinite(there).all()
     other = as_shown(batch, sensor, STATES, seed=1).measurements((0,), arrived=False)
     assert not np.allclose(other, there)
-
-
-def test_units_of_measure_change_nothing():
-    batch, own = recorded(500), Sensor(noise=1e-3, resolution=1e-4, bias=0.1, jitter_samples=0.5, dropout=0.1)
-    scaled = batch_of(batch.states / 4.0, batch.inputs, DT)
-    y = as_shown(batch, {"position": own}, STATES).measurements((0,))
-    np.testing.assert_allclose(
-        as_shown(scaled, in_units({"position": own}, {"position": 4.0}), STATES).measurements((0,)) * 4,
-        y,
-        rtol=0,
-        atol=1e-12,
-    )
 
 
 def test_what_syntheses_assume_is_the_declared_noise_and_the_coarser_resolution():

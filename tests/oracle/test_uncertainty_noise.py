@@ -70,16 +70,3 @@ def test_identical_systems_are_all_noise_and_different_ones_hardly() -> None:
     assert 0.6 < np.exp(np.log(same.ratio).mean()) < 1.7
     different = noise_share(recordings(0.3), ONE, FREQS, DT, Form.ADDITIVE)
     assert np.all(different.ratio < 0.05)
-
-
-def test_shares_do_not_depend_on_units_of_measure() -> None:
-    models = static(0.02, 0.02, units=20)
-    out, into, scale = np.array([10.0, 0.1]), np.array([3.0, 0.5]), np.array([[1.0], [2.0]]) / [1.0, 4.0]
-    plain = noise_share(models, scale, FREQS, DT, Form.ADDITIVE)
-
-    def changed(m: KoopmanMatrices) -> KoopmanMatrices:
-        return KoopmanMatrices(m.A, m.B * out[:, None] / into)
-
-    scaled = ModelSamples(changed(models.estimate), changed(models.samples))
-    other = noise_share(scaled, scale * out[:, None] / into, FREQS, DT, Form.ADDITIVE)
-    np.testing.assert_allclose(other.ratio, plain.ratio, rtol=1e-10)

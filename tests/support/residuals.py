@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kros.core.lti import StateSpace, gain
+from kros.core.lti import StateSpace
 from kros.uncertainty import Form
 from kros.uncertainty.weights.fit import Residuals
 
@@ -38,8 +38,3 @@ def of_function(function: Callable[[Array], Array]) -> Residuals:
 def of_systems(form: str, nominal: StateSpace, units: StateSpace, remainder: bool = False) -> Residuals:
     """Return the residuals of a form with the systems behind them."""
     return Residuals(Form(form), nominal, units, units.batch_shape[0], remainder)
-
-
-def of_units(units: StateSpace) -> Residuals:
-    """Return units against a plant of zero."""
-    return of_systems("additive", gain(np.zeros((units.n_outputs, units.n_inputs)), units.dt), units)

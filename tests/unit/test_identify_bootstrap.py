@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kros.core import DataError
-from kros.identify import KoopmanMatrices, edmd
+from kros.identify import KoopmanMatrices
 from kros.identify.edmd import ModelSamples, bootstrap_edmd, episode_weights
 
 
@@ -24,31 +24,10 @@ def samples(units: int = 2, draws: int = 40, spread: float = 0.02) -> ModelSampl
     return ModelSamples(whole, drawn)
 
 
-def test_weights_keep_the_number_of_episodes_and_the_variance_of_a_mean() -> None:
-    """Mean 1 and, for E episodes, covariance 1 on and -1 / (E - 1) off the diagonal: that of an unbiased variance."""
-    weights = episode_weights([4, 7], 40_000, seed=0)
-    assert weights.shape == (2, 40_000, 7)
-    assert not weights[0, :, 4:].any()
-    np.testing.assert_allclose(weights.sum(axis=2), [[4.0] * 40_000, [7.0] * 40_000])
-    for row, E in ((0, 4), (1, 7)):
-        expected = (E * np.eye(E) - 1) / (E - 1)
-        np.testing.assert_allclose(np.cov(weights[row, :, :E].T), expected, atol=0.04)
-
-
 @pytest.mark.parametrize(("episodes", "draws"), [([3, 1], 10), ([3, 3], 1), ([], 10)])
 def test_too_little_to_draw_from_is_refused(episodes: list[int], draws: int) -> None:
     with pytest.raises(DataError, match="at least two episodes"):
         episode_weights(episodes, draws, 0)
-
-
-def test_equal_weights_give_the_estimate_and_whole_weights_give_copies() -> None:
-    R = factors(2, 3)
-    weights = np.array([[[1.0, 1, 1], [2, 0, 1]]] * 2)
-    found = bootstrap_edmd(R, 2, 0.5, weights)
-    np.testing.assert_allclose(found.samples.A[:, 0], found.estimate.A, rtol=1e-10)
-    copies = edmd(np.linalg.qr(R[:, [0, 0, 2]].reshape(2, -1, 5), mode="r"), 2, 0.5)
-    np.testing.assert_allclose(found.samples.A[:, 1], copies.A, rtol=1e-9)
-    np.testing.assert_allclose(found.samples.B[:, 1], copies.B, rtol=1e-9)
 
 
 def test_a_unit_with_fewer_episodes_is_resampled_among_its_own() -> None:

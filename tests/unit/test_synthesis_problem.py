@@ -11,8 +11,6 @@ from kros.identify import ModelSet
 from kros.synthesis import Injection, ObserverProblem
 from kros.uncertainty import quantify
 
-DT = 0.01
-
 
 @pytest.fixture(scope="module")
 def models() -> ModelSet:
@@ -35,13 +33,6 @@ def test_nothing_is_left_out(models, uncertain):
     assert np.array_equal(case.C, [[1.0, 0.0, 0.0]])
     assert (case.n_original, case.injection) == (2, Injection.STATE)
     assert np.array_equal(case.output_scale, models.output_scale)
-
-
-def test_units_of_measure_change_nothing(models, uncertain):
-    recorded = ObserverProblem.from_uncertain(models, uncertain, [1e-3])
-    divided = ObserverProblem.from_uncertain(models.normalised(), uncertain, [1e-3])
-    for ours, theirs in zip(recorded.scaled, divided.scaled, strict=True):
-        assert np.allclose(ours, theirs, rtol=1e-12)
 
 
 def test_models_of_another_population_are_refused(models, uncertain):

@@ -65,18 +65,6 @@ def test_values_keys_and_channels(folder: Path) -> None:
     np.testing.assert_allclose(values, samples(1)[:, 1:] * [1e-3, 1], rtol=1e-15)
 
 
-def test_mapping_from_a_toml_file(folder: Path, tmp_path: Path) -> None:
-    path = tmp_path / "mapping.toml"
-    path.write_text(
-        "files = '(?P<unit>[^/]+)/(?P<condition>\\w+)_(?P<episode>\\d+)\\.csv'\ntime = 't'\n"
-        "[[channel]]\nname = 'u'\ncolumn = 'volt'\nrole = 'input'\nunit = 'V'\n"
-        "[[channel]]\nname = 'x'\ncolumn = 'pos'\nrole = 'state'\nmeasured = true\nunit = 'm'\nscale = 1e-3\n"
-    )
-    key = EpisodeKey("a", "cold", "2")
-    np.testing.assert_array_equal(read_csv_folder(folder, path).read(key), read_csv_folder(folder, MAPPING).read(key))
-    assert read_csv_folder(folder, str(path)).channels == read_csv_folder(folder, MAPPING).channels
-
-
 def test_several_units_in_one_file(tmp_path: Path) -> None:
     values = np.column_stack([samples(0), samples(1)[:, 1:]])
     write(tmp_path / "rig_1.csv.gz", values, "t,pos1,volt1,pos2,volt2")
@@ -85,16 +73,6 @@ def test_several_units_in_one_file(tmp_path: Path) -> None:
     population = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>\w+)_(?P<episode>\d)", channel=channel, unit=units))
     assert population.unit_ids == ("rig/joint1", "rig/joint2")
     np.testing.assert_allclose(population.read(EpisodeKey("rig/joint2", "default", "1")), values[:, 3:], rtol=1e-15)
-
-
-def test_decimal_comma_skipped_lines_and_quoted_names(tmp_path: Path) -> None:
-    text = '\ufeffBench 4\n;;\n"t";"pos; raw";"volt"\n0,00;1,5;-2e0\n0,01;2,5;3\n0,02;4,5;3\n'
-    (tmp_path / "a_1.csv").write_text(text, encoding="utf-8")
-    channel = [CHANNEL[0], {**CHANNEL[1], "column": "pos; raw"}]
-    population = read_csv_folder(
-        tmp_path, mapping(files="a_1", channel=channel, delimiter=";", decimal=",", skip_rows=2)
-    )
-    np.testing.assert_allclose(population.read(population.episodes[0]), [[1.5e-3, -2], [2.5e-3, 3], [4.5e-3, 3]])
 
 
 def test_tab_separated_without_header(tmp_path: Path) -> None:

@@ -118,12 +118,6 @@ def test_a_file_in_units_of_another_quantity_is_refused(tmp_path: Path, header: 
         read_csv_folder(tmp_path, MAPPING)
 
 
-def test_time_in_another_unit_is_converted(tmp_path: Path) -> None:
-    rows = zip(1000 * TIME, *signals(0), strict=True)
-    (tmp_path / "b_0.csv").write_text("\n".join(["t [ms],T [degC],i", *(",".join(map(str, row)) for row in rows)]))
-    assert read_csv_folder(tmp_path, MAPPING).sample_period_s == pytest.approx(0.01)
-
-
 def test_init_writes_conversions_to_si(tmp_path: Path) -> None:
     for k, unit in enumerate(("motor1", "motor2")):
         for run in (1, 2):

@@ -61,7 +61,7 @@ def test_the_selftest_leaves_out_bits_at_a_threshold(factor, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", ["lifted", "limits", "through the input", "filter bank"])
+@pytest.mark.parametrize("kind", ["limits", "through the input", "filter bank"])
 def test_a_parameter_that_follows_the_machine(kind, tmp_path):
     observer, (y, u) = MACHINES[kind](), samples(800)
     wanted, status = in_python(observer, y, u, "phase")

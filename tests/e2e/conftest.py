@@ -20,7 +20,6 @@ from kros.design.methods import METHODS
 from kros.design.methods.robust import Published, WorstCaseH2
 from kros.report.figures import Drawn, draw
 from kros.report.run_folder import RunFolder
-from kros.uncertainty.bounded import Options
 from kros.uncertainty.settings import SET, QuantifySettings
 
 # An estimator that learns from less: the keys of [estimator].
@@ -46,13 +45,9 @@ def low_orders() -> Iterator[None]:
     class First(QuantifySettings):
         max_order: int = 1
 
-    class FirstOfSystems(Options):
-        max_order: int = 1
-
     methods = [replace(m, max_order=1) if isinstance(m, Published | WorstCaseH2) else m for m in METHODS]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(import_module("kros.uncertainty.quantify"), "QuantifySettings", First)
-        patch.setattr(import_module("kros.uncertainty.quantify"), "Options", FirstOfSystems)
         patch.setattr(import_module("kros.uncertainty.unit_residuals"), "SET", replace(SET, entry_order=1))
         patch.setattr("kros.design.methods.METHODS", tuple(methods))
         yield

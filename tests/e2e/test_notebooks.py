@@ -35,7 +35,7 @@ def test_own_data(run):
 
 
 @pytest.mark.slow
-def test_control_models(low_order_weights, run):
+def test_control_models(run):
     found = run("control_models")
     assert len(found["largest"]) == 8
     assert 0.99 < max(found["largest"].values()) <= 1  # recomputed in the notebook, with a finer grid

@@ -1,4 +1,4 @@
-"""Studies of any sampling rate run with defaults: nothing but the axis of frequency may depend on the sampling period."""
+"""Studies of any sampling rate run: nothing but the axis of frequency may depend on the sampling period."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("low_order_weights")
 PERIODS_S = (10.0, 5e-5)
 # Less of everything that takes long; none of it knows of seconds.
 QUICK = ["uncertainty.n_freqs=100", "estimator.rows=2000", "estimator.episodes=16", "estimator.sample_episodes=8"]
-QUICK += ["estimator.restarts=2", "estimator.features=8"]
+QUICK += ["estimator.features=8"]
 
 
 @pytest.fixture(scope="module")

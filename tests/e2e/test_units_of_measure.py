@@ -50,7 +50,7 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
         "uncertainty": {"n_freqs": 50},
         "synthesis": {"methods": ["worst_case_h2", "residual_h2", "estimator"]},
         "sensor": {"position": {"noise": 4e-4 * factors[0]}},
-        "estimator": {"rows": 3000, "sample": 1000, "restarts": 2, "features": 8, "folds": 2, "parts": 2}
+        "estimator": {"rows": 3000, "sample": 1000, "features": 8, "folds": 2, "parts": 2}
         | {"gap_episodes": 3, "gap_samples": 60_000},
     }
     metrics = run_study(validate_config(raw, folder), folder / "run", until=until).metrics

@@ -39,7 +39,7 @@ class Whitening:
         bank, settings = design.bank, design.settings
         size = bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
-        errors = [(one, other, qr_triangle(wrong * scale)) for one, other, wrong in design.errors(X)]
+        errors = [(one, other, few_columns(wrong * scale)) for one, other, wrong in design.errors(X)]
         trust = np.vstack([np.diag(bank.trust(settings.nonlinear_trust)), *(np.sqrt(one) * R for one, _, R in errors)])
         disturbed = np.vstack([np.sqrt(other) * R for _, other, R in errors])
         least = np.sqrt(settings.settled_share) * disturbed
@@ -48,6 +48,15 @@ class Whitening:
         directions = V[:count].T / sigma[:count] / size[:, None]
         moments = (rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, disturbed)))
         return cls(sample, directions, sigma[:count] ** -2.0, *moments)
+
+
+def few_columns(rows: Array) -> Array:
+    """Return the triangle of rows, of which most may be zero in most columns."""
+    used = rows.any(axis=0)
+    triangle = qr_triangle(rows[:, used])
+    found = np.zeros((len(triangle), rows.shape[1]))
+    found[:, used] = triangle
+    return found
 
 
 @frozen

@@ -199,7 +199,7 @@ class Design:
                 bridged.append(self.seen(self.signals(batch, line), at))
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
                 biased.append(self.seen(self.signals(batch, y + bias), at))
-        errors = [(0.0, 1.0, np.vstack(restarts)), (settings.restart_share, 0.0, np.vstack(elsewhere))]
+        errors = [(0.0, 1.0, np.vstack(restarts)), (settings.start_share, 0.0, np.vstack(elsewhere))]
         for share, wrong in ((settings.gap_share, bridged), (1.0, biased)):
             errors += [(share, 0.0, np.vstack(wrong) - rows)] if wrong else []
         return errors

@@ -56,15 +56,18 @@ class EstimatorSettings(Settings):
     nonlinear_trust: float = Field(
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )
+    start_share: float = Field(
+        0.1,
+        ge=0,
+        description="weight of the errors that the first sample makes at another place: rows with target zero",
+    )
     restart_share: float = Field(
         0.03,
         gt=0,
-        description="weight of the errors that a start elsewhere makes and, for the time after a start or a loss, one "
-        "in the middle of an episode: rows with target zero, since machines start elsewhere than in recordings",
+        description="weight of the errors that a start in the middle of an episode makes, for the time after a start "
+        "or a loss: rows with target zero, since machines start elsewhere than in recordings",
     )
-    settled_share: float = Field(
-        1e-3, gt=0, description="weight of the errors of a start in the middle of an episode for all other time"
-    )
+    settled_share: float = Field(1e-3, gt=0, description="weight of these errors for all other time")
     gap_share: float = Field(
         1e-3,
         ge=0,

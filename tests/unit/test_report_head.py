@@ -193,7 +193,9 @@ def test_the_head_names_every_hidden_state_and_its_worst_condition(tmp_path: Pat
     assert "cold" not in velocity
     assert current.endswith("(worst unit b: 6.20 %; cold: 7.00 %)")
     assert force == "error of force: 8.00 % of the largest value (worst unit b: 8.00 %; cold: 45.0 %)"
+    assert "force (45.0 %" in judge(Facts(metrics(evaluation=rows, **conditions))).reasons[-1].text
     rows.append(row(NAME, None, unit="c", channel="velocity") | {"condition": "cold"})
+    assert judge(Facts(metrics(evaluation=rows, **conditions))).status is Status.NOT_READY
     assert "cold: diverged" in lines_of(RunResult(tmp_path, metrics(evaluation=rows, **conditions)))[1]
 
 

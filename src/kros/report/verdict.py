@@ -120,10 +120,15 @@ def _numbers(facts: Facts) -> list[Number]:
 
 def _elsewhere(facts: Facts, channel: str) -> list[str]:
     """Return the mean error in the worst condition, if this is not that of the models."""
-    cells = {t.condition: t.cells.get(facts.deployed, {}).get(channel, ErrorCell()) for t in facts.tables}
-    worst, cell = max(cells.items(), key=lambda item: (item[1].diverged, item[1].mean or 0.0))
+    worst, cell = _worst(facts, channel)
     error = "diverged" if cell.diverged else f"{number(cell.mean)} %"
     return [] if worst == facts.table.condition else [f"{condition_label(worst) or worst}: {error}"]
+
+
+def _worst(facts: Facts, channel: str) -> tuple[str, ErrorCell]:
+    """Return the condition in which the deployed observer's error of a channel is largest, and the error."""
+    cells = {t.condition: t.cells.get(facts.deployed, {}).get(channel, ErrorCell()) for t in facts.tables}
+    return max(cells.items(), key=lambda item: (item[1].diverged, item[1].mean or 0.0))
 
 
 def _lag(lag_s: float | None) -> str:
@@ -140,7 +145,7 @@ def _stopping(facts: Facts) -> Checks:
         yield "The run stopped before an observer was designed.", "Run it to its end.", "run"
     elif not facts.cells:
         yield f"“{facts.label}” has not been evaluated.", "Run it to its end.", "run"
-    elif any(facts.cells[c].mean is None for c in hidden):
+    elif any(facts.cells[c].mean is None or _worst(facts, c)[1].diverged for c in hidden):
         text = f"The estimates of “{facts.label}” diverge on held-out episodes."
         yield text, "Do not use it; look at the models first.", "models"
     elif hidden and not_improved(facts) == hidden:
@@ -210,7 +215,7 @@ def _of_errors(facts: Facts) -> Checks:
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."
         yield text, "Do not rely on the estimate more than on the model.", "errors"
-    if large := {c: e for c in hidden if (e := facts.cells[c].mean or 0.0) > 100 * THRESHOLDS.large}:
+    if large := {c: e for c in hidden if (e := _worst(facts, c)[1].mean or 0.0) > 100 * THRESHOLDS.large}:
         each = joined([f"{words(c)} ({number(e)} % of the largest value)" for c, e in large.items()])
         yield f"The error is large: {each}.", "Measure another signal, or use the estimate for trends alone.", "errors"
     for channel, bound in (facts.entry.get("set_bound") or {}).items():

@@ -26,9 +26,9 @@ from kros.evaluate.sensor import as_arriving
 from kros.export import CompiledObserver, export_c
 from kros.export.c99.numbers import Source
 from kros.identify import IdentifiedModels
-from kros.observer import Observer, run_observer
+from kros.observer import Observer
 from kros.observer.screen import screened
-from kros.observer.simulate import Course
+from kros.observer.simulate import Course, run_observers
 from kros.observer.tracking import PhaseLockedLoop
 from kros.study.config import Stage
 from kros.study.engine.context import open_finished
@@ -223,7 +223,7 @@ def in_steps(observer: Observer, track: str | None, y: np.ndarray, u: np.ndarray
     if track is not None:
         running.track(track)
     for k in range(len(y)):
-        found[k, 0] = np.asarray(running.estimate)[: len(observer.recorded)]
+        found[k, 0] = np.asarray(running.estimate)
         running.step(y[k, 0], u[k, 0])
     return found
 
@@ -237,7 +237,7 @@ def least_input(observer: Observer) -> np.ndarray:
 def extended(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict) -> np.ndarray:
     """Return the estimates in extended precision, written out."""
     lifting, K, real = observer.lifting, observer.controller, np.longdouble
-    n, first = lifting.n_states, run_observer(observer, y[:2], u[:2], own)[0]
+    n, first = lifting.n_states, run_observers([observer], y[:2], u[:2], own)[0, 0]
     A, B, into, *linear = (
         np.asarray(M, dtype=real) for M in (observer.A[:n], observer.B[:n], observer.into[:n], K.A, K.B, K.C, K.D)
     )

@@ -116,7 +116,7 @@ def in_python(observer, y, u, track=None):
     if track is not None:
         running.track(track)
     found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y, u, strict=True)]
-    return np.array([x for x, _ in found])[:, : len(observer.recorded)], np.array([status for _, status in found])
+    return np.array([x for x, _ in found]), np.array([status for _, status in found])
 
 
 def apart(found, wanted):

@@ -7,7 +7,7 @@ from random_models import random_observer
 from kros.core.errors import DataError, DimensionError
 from kros.data import EpisodeBatch
 from kros.lifting import Lifting
-from kros.observer import Observer, run_observer
+from kros.observer import Observer, SampleStatus, run_observer
 from kros.synthesis import Injection
 
 LIFTING = Lifting(("position", "velocity", "current"), ("sin(10*position + phase)",), ("phase",))
@@ -34,6 +34,17 @@ def test_a_controller_of_the_wrong_size_is_refused():
         Observer("x", LIFTING, o.A, o.B, (0,), ("a", "b"), o.controller, Injection.INPUT, 0.001)
     with pytest.raises(DimensionError, match="at least one sample"):
         run_observer(o, np.zeros((5, 2, 1)), np.zeros((4, 2, 2)))
+
+
+def test_samples_that_are_not_given_are_missing():
+    one, other = (random_observer(LIFTING).start([0.5]) for _ in range(2))
+    for running, nothing in ((one, (None, None)), (other, ([np.nan], [np.nan, np.nan]))):
+        running.step([0.5], [1.0, 2.0])
+        running.step(*nothing)
+        assert running.status == SampleStatus.MISSING | SampleStatus.INVALID_INPUT
+    np.testing.assert_array_equal(one.estimate, other.estimate)
+    other.step([0.5], [0.0, 0.0])
+    assert one.step([0.5], None) != other.estimate  # inputs are held, and not zero
 
 
 def test_masked_measurements_are_missing_and_text_is_refused():

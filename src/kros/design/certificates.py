@@ -106,7 +106,7 @@ def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Part
     observer = design.observer
     n, at = len(observer.recorded), list(observer.measured)
     estimates = run_observer(observer, batch.measurements(at), batch.inputs, observer.own(batch.parameters))
-    square = error_rms(estimates[..., :n], batch.states, batch.lengths) ** 2
+    square = error_rms(estimates, batch.states, batch.lengths) ** 2
     units = list(dict.fromkeys(batch.units))
     errors = np.sqrt([square[[u == unit for u in batch.units]].mean(axis=0) for unit in units])
     sizes, by = task.models.output_scale[:n], factors(observer, {})[0]

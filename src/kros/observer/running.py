@@ -19,7 +19,7 @@ from .tracking import PhaseLockedLoop
 
 
 class Estimate(Mapping[str, float]):
-    """Estimated states by name; ``np.asarray(estimate)`` has shape (n,).
+    """Estimated states by name, those that recordings hold; ``np.asarray(estimate)`` has shape (n,).
 
     Examples
     --------
@@ -78,7 +78,7 @@ class RunningObserver:
     def __init__(self, observer: ObserverData, y: ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
         self._screen, self._course = Screen.of(observer), Course(observer, 1, parameters)
-        self._places = {name: i for i, name in enumerate(observer.lifting.states)}
+        self._places = {name: i for i, name in enumerate(observer.recorded)}
         self._watch = None if observer.monitor is None else Watch(observer.monitor)
         self.parameters = parameters
         self.reset(y)
@@ -86,7 +86,7 @@ class RunningObserver:
     @property
     def states(self) -> Names:
         """Names of the estimated states, in order."""
-        return self.observer.lifting.states
+        return self.observer.recorded
 
     @property
     def parameters(self) -> Mapping[str, float]:
@@ -120,7 +120,7 @@ class RunningObserver:
 
     def reset(self, y: ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
-        first = self._sample(y)
+        first = self._sample(y, np.zeros(len(self.observer.inputs)))
         self._status, self._fresh = (
             SampleStatus(int(first.status[0, 0])),
             bool(self._screen.enough(np.isfinite(first.y)).all()),
@@ -147,16 +147,17 @@ class RunningObserver:
         nu = np.where(np.isfinite(given), steps.innovation(given), 0.0)
         return self._forward(steps.x + nu @ self._filter_gain.T)
 
-    def step(self, y: ArrayLike, u: ArrayLike) -> Estimate:
+    def step(self, y: ArrayLike | None, u: ArrayLike | None) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
 
         Parameters
         ----------
         y : array_like, shape (q,)
-            NaN, or infinite, where a measurement is missing or too old: it corrects nothing at this step.
+            NaN, or infinite, where a measurement is missing or too old: it corrects nothing at this step. None where
+            all are missing.
         u : array_like, shape (m,)
-            Not finite where it is not known: the last good value stands for it, zero before the first. What is
-            implausible: see `screen`.
+            Not finite where it is not known, or None: the last good value stands for it, zero before the first. What
+            is implausible: see `screen`.
 
         Returns
         -------
@@ -188,13 +189,13 @@ class RunningObserver:
             self._status |= SampleStatus.UNCERTIFIED
         return self.estimate
 
-    def _sample(self, y: ArrayLike, u: ArrayLike | None = None, held: Held | None = None) -> Screened:
-        """Return a sample as the observer takes it; inputs are zero where none are known yet."""
-        inputs = self.observer.inputs
-        y, u = self._shaped(y, "measurements", self.observer.outputs), np.zeros(len(inputs)) if u is None else u
-        return self._screen.take(y[None, None], self._shaped(u, "inputs", inputs)[None, None], held)
+    def _sample(self, y: ArrayLike | None, u: ArrayLike | None = None, held: Held | None = None) -> Screened:
+        """Return a sample as the observer takes it."""
+        y, u = self._shaped(y, "measurements", self.observer.outputs), self._shaped(u, "inputs", self.observer.inputs)
+        return self._screen.take(y[None, None], u[None, None], held)
 
-    def _shaped(self, values: ArrayLike, what: str, names: Sequence[str]) -> Array:
+    def _shaped(self, values: ArrayLike | None, what: str, names: Sequence[str]) -> Array:
+        values = np.full(len(names), np.nan) if values is None else values
         array = np.array(numbers(self.observer, values, what), ndmin=1)  # a copy: the caller may use its memory again
         if array.shape != (len(names),):
             raise DimensionError(
@@ -208,4 +209,4 @@ class RunningObserver:
         ahead, steps = self._course.ahead(), self._course.steps
         if len(ahead):
             x = forward(self.observer, steps.values, np.array([len(ahead)]), x, steps.earlier(ahead[0]), ahead)
-        return Estimate(self._places, self.observer.runtime.clip_estimate(x[0].copy()))
+        return Estimate(self._places, self.observer.runtime.clip_estimate(x[0, : len(self._places)].copy()))

@@ -41,7 +41,7 @@ def run_observer(
     Returns
     -------
     ndarray, shape (n_samples, batch, n)
-        Row k is the estimate of the state at k from what arrived up to k - 1; row 0 is the start.
+        Row k is the estimate of the recorded states at k from what arrived up to k - 1; row 0 is the start.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return run_observers([observer], y, u, parameters)[0]
+    return run_observers([observer], y, u, parameters)[0, ..., : len(observer.recorded)]
 
 
 def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Parameters | None = None) -> Array:

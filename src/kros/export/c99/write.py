@@ -182,7 +182,7 @@ class Golden:
                 running.track(track)
             samples = [*zip(factor * y, factor * u, strict=True)] * passes
             steps = [(np.asarray(running.step(*sample)), int(running.status)) for sample in samples]
-            x_hat = np.array([x for x, _ in steps[:count]])[:, : len(observer.recorded)]
+            x_hat = np.array([x for x, _ in steps[:count]])
             return x_hat, np.array([s for _, s in steps], np.uint32)
 
         x_hat, status = run(1.0)

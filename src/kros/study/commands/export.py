@@ -70,7 +70,7 @@ def exactness(folder: Path, observer: Observer, context: Context) -> str:
     except KrosError as error:
         log.warning("not compared with Python, since the run's recordings cannot be read: %s", error)
         return ""
-    wanted = run_observer(observer, arrived.y, arrived.u, arrived.parameters)[1:, 0, : len(observer.recorded)]
+    wanted = run_observer(observer, arrived.y, arrived.u, arrived.parameters)[1:, 0]
     signals = observer.outputs, observer.inputs, observer.recorded
     of_y, of_u, of_x = (recorded_factors(observer, names) for names in signals)
     values = {name: np.ravel(value).item() for name, value in arrived.parameters.items()}

@@ -138,7 +138,7 @@ def test_an_output_that_is_full_or_gone():
         ("a = " + "[" * 5000, "nested"),
         ("[data]\nsource = 'recordings'\n[identify]\nalpha = inf\n", "alpha"),
         ("[data]\nsource = 'recordings'\n[load]\ninertia = nan\n", "inertia"),
-        ('[data]\nsource = "a\\u0000b"\n', "nul"),
+        ('[data]\nsource = "a\\u0000b"\n', "NUL"),
         ("[data]\nsource = 'recordings'\n[[lifting.families]]\nkind = 'harmonics'\nangle = 5\nratio = []\n", "lifting"),
         ("data = 5\n", "data"),
     ],

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace, gain
-from kros.data.batch import hold_missing
 from kros.lifting import Lifting
 from kros.observer import Observer
+from kros.observer.baselines.difference import hold_missing
 from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.sensor_gains import sensor_gains
 from kros.observer.simulate import run_observers

@@ -111,7 +111,7 @@ def frame(**changes: Any) -> Any:
 
 def test_frame_refuses() -> None:
     pd = pytest.importorskip("pandas")
-    with pytest.raises(DataError, match="column 'v' occurs 0 times"):
+    with pytest.raises(DataError, match="column 'v' is missing; the columns are"):
         from_frame(frame().drop(columns="v"), CHANNELS, time="t")
     with pytest.raises(DataError, match="one of time and sample_period_s"):
         from_frame(frame(), CHANNELS)
@@ -120,9 +120,11 @@ def test_frame_refuses() -> None:
     with pytest.raises(DataError, match=r"column 'x' should hold numbers"):
         from_frame(frame(x="wide"), CHANNELS, time="t")
     disordered = np.arange(12)[[0, 1, 2, 3, 4, 6, 5, 7, 8, 9, 10, 11]] * 0.1
-    population = from_frame(frame(t=np.tile(disordered, 3)), CHANNELS, time="t")
     with pytest.raises(DataError, match=r"time should increase, found 0\.6 s at sample 5 and 0\.5 s at sample 6"):
-        population.read(population.episodes[0])
+        from_frame(frame(t=np.tile(disordered, 3)), CHANNELS, time="t")
+    twice = pd.concat([frame(), frame()], axis=1)
+    with pytest.raises(DataError, match="column 'x' occurs 2 times; the columns are"):
+        from_frame(twice, CHANNELS, time="t")
     with pytest.raises(DataError, match="found ndarray; use from_arrays"):
         from_frame(values(0), CHANNELS, time="t")
     with pytest.raises(DataError, match="population is empty"):

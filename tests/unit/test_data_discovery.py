@@ -13,8 +13,8 @@ from kros.core.errors import DataError
 from kros.data.discovery.dialect import look_at
 from kros.data.discovery.discover import Wanted, discover
 from kros.data.discovery.filenames import infer_names
-from kros.data.discovery.roles import identifier, kind_of, time_scale
-from kros.data.measures import split_header
+from kros.data.discovery.roles import time_scale
+from kros.data.measures import identifier, kind_of, split_header
 
 UNITS, EPISODES = range(1, 4), range(1, 4)
 
@@ -28,6 +28,11 @@ def names(template: str, **other: object) -> list[str]:
         for c in conditions
         for e in EPISODES
     ]
+
+
+def labelled(template: str) -> list[str]:
+    """Paths with conditions that no list of words holds."""
+    return [path.replace("noload", "light").replace("load", "heavy") for path in names(template)]
 
 
 @pytest.mark.parametrize(
@@ -108,6 +113,11 @@ def test_conditions_groups_and_single_machines():
         (names("box{u}/box{u}_{e}.csv"), (None, "box1", None, "1"), 3, False),
         (names("run{e}_{c}_drive{u}.csv"), (None, "drive1", "load", "run1"), 3, False),
         (names("{c}/{u}/{e}.csv"), (None, "1", "load", "1"), 3, False),
+        (labelled("conv{u}_{c}_run{e}.csv"), (None, "conv1", "heavy", "run1"), 3, False),
+        (labelled("{c}_KX{u}_{e}.csv"), (None, "KX1", "heavy", "1"), 3, False),
+        (labelled("run{e}_conv{u}_{c}.csv"), (None, "conv1", "heavy", "run1"), 3, False),
+        ([f"conv{u}_{c}.csv" for u in UNITS for c in ("sine", "chirp")], (None, "conv1", None, "sine"), 3, False),
+        (["x1_load.csv", "x2_noload.csv"], (None, "x1", "load", None), 2, True),
         (names("M{u} {c} {e}.Csv"), (None, "M1", "load", "1"), 3, False),
         (names("data/exp/v2/unit-{u}/rec {e}.tsv"), (None, "1", None, "1"), 3, False),
         (names("rig1_motor{u}_run{e}.csv"), (None, "motor1", None, "run1"), 3, False),
@@ -142,7 +152,15 @@ def test_hostile_layouts_are_read_as_people_do_or_asked_about(paths, first, unit
         ("speed_km_h", "speed", "km/h"),
         ("a_m_per_s2", "a", "m/s2"),
         ("n_1_min", "n", "1/min"),
-        ("mm_s", "mm", "s"),
+        ("current_A", "current", "A"),
+        ("voltage_V", "voltage", "V"),
+        ("temp_C", "temp", "C"),
+        ("speed_mps", "speed", "mps"),
+        ("elapsed_s", "elapsed", "s"),
+        ("time_min", "time", "min"),
+        ("angle_min", "angle_min", ""),
+        ("i_s", "i_s", ""),
+        ("theta_m", "theta_m", ""),
         ("pos_x", "pos_x", ""),
         ("v_A", "v_A", ""),
         ("tau_max", "tau_max", ""),

@@ -19,7 +19,7 @@ _OF_FAMILIES = (TypeError, LookupError, AttributeError, ArithmeticError, MemoryE
 class Settings(BaseModel):
     """Base of all settings: unknown names are errors, values do not change."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, ser_json_inf_nan="constants")
 
     @classmethod
     def of(cls, raw: Any, asked: str) -> Self:
@@ -36,12 +36,13 @@ class Settings(BaseModel):
     @classmethod
     def _explain(cls, error: Any) -> str:
         key, value = ".".join(p for p in error["loc"] if isinstance(p, str)), error.get("input")
-        unknown, text = error["type"] == "extra_forbidden", str(error["msg"]).lower()
+        unknown, text = error["type"] == "extra_forbidden", str(error["msg"]).removeprefix("Value error, ")
         if reason := instead_of(key if unknown else f"{key}={value}"):
             return reason
         if unknown:
             known = cls._names_in(error["loc"][:-1])
             return f"unknown key{did_you_mean(error['loc'][-1], known) or ';'} known are {', '.join(known)}"
+        text = text[:1].lower() + text[1:]
         return text if isinstance(value, dict) else f"{text}, found {shortened(repr(value))}"
 
     @classmethod

@@ -15,7 +15,7 @@ Examples
 
 from ..core import refusing
 from . import steps
-from .batch import EpisodeBatch, hold_missing
+from .batch import EpisodeBatch
 from .population import (
     DEFAULT_CONDITION,
     OUTLIERS,

@@ -135,16 +135,6 @@ class EpisodeBatch:
         return np.swapaxes(self.states[: history + 1], 0, 1)
 
 
-def hold_missing(y: Array) -> Array:
-    """Return measurements, (n_samples, ...), with the last that arrived for those that are missing, zero before it."""
-    there = np.isfinite(y)
-    if there.all():
-        return y
-    shape = (-1, *[1] * (y.ndim - 1))
-    last = np.maximum.accumulate(np.where(there, np.arange(len(y)).reshape(shape), 0), axis=0)
-    return np.take_along_axis(np.where(there, y, 0.0), last, axis=0)
-
-
 def _side_by_side(episodes: Sequence[Array], lengths: Whole) -> Array:
     """Return episodes as one array, shape (n_samples, batch, n_columns), shorter ones held at their last sample."""
     values = np.empty((lengths.max(), len(episodes), episodes[0].shape[1]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -21,19 +21,41 @@ V voltage|N m torque|N force|Pa pressure|K temperature|W other|kg other|ohm othe
 _SPELLED = """
 ° deg|grad deg|rev turn|revs turn|turns turn|u turn|umdr turn|upm rpm|1/min rpm|u/min rpm|min-1 rpm|min^-1 rpm|1/s Hz
 rev/s turn/s|rev/min rpm|a A|v V|w W|n N|pa Pa|kpa kPa|hz Hz|k K|c degC|°c degC|°f degF|sek s|°/s deg/s|°/s^2 deg/s^2
-Nm N*m|mNm mN*m|kNm kN*m|Ncm N*cm|kn kN
+Nm N*m|mNm mN*m|kNm kN*m|Ncm N*cm|kn kN|mps m/s
 """
 # what is a unit without brackets, too, in the order in which names are chosen
 _WORDS = """
-rad mrad deg ° grad rev turn turns u umdr m mm cm µm μm um km in inch counts cnt rad/s deg/s °/s m/s mm/s cm/s km/h rpm
-1/min u/min min-1 min^-1 rev/s upm Hz m/s2 m/s^2 m/s² rad/s2 rad/s^2 rad/s² deg/s² °/s² A mA kA V mV kV Nm N·m N*m mNm
-kNm Ncm N kN MN Pa kPa MPa hPa bar mbar psi °C degC K °F degF C W kW kg g % - 1 l/min l/s pct percent none bool hex dez
-s sec seconds sek ms msec us µs μs ns min h mbar
+rad mrad deg ° grad rev turn turns U umdr m mm cm µm μm um km in inch counts cnt rad/s deg/s °/s m/s mps mm/s cm/s km/h
+rpm 1/min u/min min-1 min^-1 rev/s upm Hz m/s2 m/s^2 m/s² rad/s2 rad/s^2 rad/s² deg/s² °/s² A mA kA V mV kV Nm N·m
+N*m mNm kNm Ncm N kN MN Pa kPa MPa hPa bar mbar psi °C degC K °F degF C W kW kg g % - 1 l/min l/s pct percent none bool
+hex dez s sec seconds sek ms msec us µs μs ns min h
 """
 _MORE = """
 degree degrees radian meter metre millimeter second minute hour volt amp amps ampere newton pascal watt kelvin celsius
 degree_Celsius volts hertz kHz MHz GPa kWh mW MW uA uV nA nm mH uH Ohm mF uF nF mT mbar torr atm lbf ft lb t
 """  # that pint knows too
+_QUANTITIES = {
+    "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl ref reference "
+    "sollgeschwindigkeit consigne con ctrl control input inputs pwm duty stell stellgroesse stellwert feedforward "
+    "demand demanded set vorgabe commande u",
+    "spare": "filt filtered smooth smoothed index idx sample samples counter count nr no number status flag error err "
+    "saturation sat mode id fault fehler zaehler",
+    "time": "time zeit t timestamp timestamps date datum uhrzeit clock temps tijd tiempo tempo secs seconds millis "
+    "datetime zeitstempel elapsed",
+    "angle": "angle winkel theta phi alpha beta gamma q encoder enc rotation drehwinkel angolo",
+    "position": "pos position lage weg stroke hub displacement x y z istposition posizione travel",
+    "velocity": "vel velocity speed drehzahl geschwindigkeit omega rpm rate v w dq qd vitesse istdrehzahl velocita",
+    "acceleration": "acc accel acceleration beschleunigung",
+    "current": "current strom i iq courant amp amps corrente motorstrom",
+    "torque": "torque tau moment drehmoment couple coppia",
+    "force": "force kraft f effort forza",
+    "pressure": "pressure druck p pression oeldruck",
+    "temperature": "temp temperature temperatur",
+    "voltage": "volt voltage spannung tension",
+}
+_OF_WORD = {word: kind for kind, words in _QUANTITIES.items() for word in words.split()}
+_LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
+_LATIN = dict(zip("äöüßÄÖÜΔωφθατ", _LETTERS.split(), strict=True))
 _EXPRESSION = re.compile(r"[^\W\d_]+(?:\^-?\d)?(?:[*/ ][^\W\d_]+(?:\^-?\d)?)*")
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
 _AFTER = re.compile(r"^(.+?)(?:\s+in\s+|\s*/\s*|\s*,\s*|\s+)(\S+)$")
@@ -119,20 +141,52 @@ def unit_of_factor(factor: float, unit: str) -> str:
     return ""
 
 
+def identifier(text: str, taken: Collection[str] = ()) -> str:
+    """Return a name for a channel that may stand in formulas and in C source, as close to the header as can be."""
+    if text.isidentifier() and text.isascii() and text not in taken:
+        return text
+    spelled = "".join(_LATIN.get(letter, letter) for letter in text)
+    ascii_text = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode().lower()
+    name = re.sub(r"\W+", "_", ascii_text).strip("_") or "channel"
+    name = name if name[0].isalpha() else f"c{name}"
+    numbered = (f"{name}_{n}" for n in range(2, len(taken) + 3))
+    return next(n for n in (name, *numbered) if n not in taken)
+
+
+def words_of(name: str) -> list[str]:
+    """Return the kinds that the words of a name stand for, with nothing for words that are not known."""
+    apart = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
+    words = identifier(f"{apart} ").lower().split("_")
+    return [_OF_WORD.get(re.sub(r"\d+$", "", word), "input" if word.startswith("soll") else "") for word in words]
+
+
+def kind_of(name: str, unit: str = "") -> str:
+    """Return the kind of quantity that a channel is, by its unit of measure or its name, or nothing."""
+    known = measure(unit)
+    kind = "other" if known is None else KINDS[known.si]
+    quantities = (of for of in words_of(name) if of not in ("", "input", "spare"))
+    return next(quantities, "") if kind == "other" else kind
+
+
 def split_header(text: str) -> tuple[str, str]:
     """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A``, ``v_m/s`` or ``v_m_s``."""
     text = text.strip()
     bracketed, after = _BRACKETED.match(text), _AFTER.match(text)
     if bracketed and bracketed[1]:
         return bracketed[1].strip(), bracketed[2]
-    words = text.replace("_per_", "_").split("_")
-    for count in range(min(2, len(words) - 1), 0, -1):  # rate_deg_s, then time_s
-        stem, last = "_".join(words[:-count]), "/".join(words[-count:])
-        clear = (len(last) > 1 or last == "s") and last not in ("in", "no", "none", "min")
-        if stem and is_word(last) and (clear or stem.lower() in ("t", "time", "zeit")):
-            return stem, last
-    split = after and is_word(after[2]) and (len(after[2]) > 1 or "/" in text or " in " in text)
-    return (after[1].strip(), after[2]) if after and split else (text, "")
+    words, marked = text.replace("_per_", "_").split("_"), "/" in text or " in " in text
+    counts = range(min(2, len(words) - 1), 0, -1)  # rate_deg_s, then time_s
+    ends = [("_".join(words[:-count]), "/".join(words[-count:]), False) for count in counts]
+    ends += [(after[1].strip(), after[2], marked)] if after else []
+    return next(((stem, last) for stem, last, clear in ends if stem and _is_unit(last, stem, clear)), (text, ""))
+
+
+def _is_unit(last: str, stem: str, marked: bool) -> bool:
+    """Tell whether the last word of a header is a unit: of several letters, or of the kind that the others name."""
+    known, kind = measure(last) if last in _WORDS.split() else None, kind_of(stem)
+    fits = known is not None and kind == KINDS[known.si]  # i_A, and not v_A or i_s
+    unknown = kind == "" and last in KINDS and last.isupper()  # bus_V
+    return fits or unknown or (is_word(last) and (marked or (len(last) > 1 and last not in ("in", "none", "min"))))
 
 
 def is_unit_row(cells: Sequence[str]) -> bool:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
-from functools import lru_cache
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydantic import ValidationError
 
-from ..core import Array, ByName, ConfigError, DataError, digest_of, frozen, shortened, stamp_of, united
+from ..core import Array, ByName, ConfigError, DataError, frozen, shortened, united
 from .population import Channels, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key
 from .recording import Recording, Recordings, check_even, check_period, check_structure, checked_blocks, estimate_period
 from .steps import STEPS, Signals, Step
@@ -199,18 +198,3 @@ def scale_population(population: Population, sizes: Mapping[str, float]) -> Popu
     source = replace(population.source, steps=(*population.source.steps, divided))
     columns = (replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True))
     return replace(population, source=source, columns=tuple(columns))
-
-
-def recording_marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
-    """Return digests of all that the samples of every group follow from; None where the recordings are in no file."""
-    read = source.recordings
-    settings = [(f.name, getattr(read, f.name)) for f in fields(read) if f.name != "places"]
-    about = (source.channels, source.period_s, source.steps, source.gaps)
-    stamp, how = lru_cache(stamp_of), digest_of(about, type(read).__name__, settings, declared)
-
-    def mark(keys: Sequence[EpisodeKey]) -> str | None:
-        files = [read.file(read.places[key]) for key in keys]
-        rows = [(key, read.places[key], stamp(f)) for key, f in zip(keys, files, strict=True) if f is not None]
-        return digest_of(how, rows) if len(rows) == len(keys) else None
-
-    return [mark(keys) for keys in groups]

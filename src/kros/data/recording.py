@@ -143,7 +143,7 @@ def check_increasing(recording: Recording, where: str = "") -> None:
         k = int(bad[0])
         raise DataError(
             f"{title(recording.key)}{where}: time should increase, found {time[k]:g} s at sample {k} and "
-            f"{time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps); remove repeated or disordered samples."
+            f"{time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps); sort samples by time, remove repeated ones."
         )
 
 

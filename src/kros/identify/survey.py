@@ -8,18 +8,18 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..core import ITERATED, Array, DataError, Work
-from ..core.artifacts import Storable, divided, file_digest
-from ..core.files import is_file, link_or_copy
+from ..core.artifacts import Storable, digest_of, divided, file_digest
+from ..core.files import is_file, link_or_copy, stamp_of
 from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, scaling_of, split_episodes
-from ..data.prepare import recording_marks
+from ..data.prepare import PreparedSource
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..data.recording import check_population, refuse_copies, some, title, usable, usable_episodes
 from .likeness import course, moments, odd, unlike
@@ -144,7 +144,7 @@ def survey(
         folder.mkdir(parents=True)
     tasks = [_Group(population.select([u], [c]), folder, chosen.on_nan) for u, c, _ in population.groups()]
     keys = (keys for _, _, keys in population.groups())
-    marks = recording_marks(population.source, keys, chosen.on_nan, folder is None)
+    marks = _marks(population.source, keys, chosen.on_nan, folder is None)
     groups = list(
         (work or Work()).recall(
             "read", _read_group, tasks, marks, _GroupFacts, lambda _, known: copy is None or copy.reuse(known)
@@ -161,6 +161,21 @@ def survey(
     for alert in facts.alerts:
         log.warning("%s", alert)
     return retained, facts
+
+
+def _marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
+    """Return digests of all that the samples of every group follow from; None where the recordings are in no file."""
+    read = source.recordings
+    settings = [(f.name, getattr(read, f.name)) for f in fields(read) if f.name != "places"]
+    about = (source.channels, source.period_s, source.steps, source.gaps)
+    stamp, how = lru_cache(stamp_of), digest_of(about, type(read).__name__, settings, declared)
+
+    def mark(keys: Sequence[EpisodeKey]) -> str | None:
+        files = [read.file(read.places[key]) for key in keys]
+        rows = [(key, read.places[key], stamp(f)) for key, f in zip(keys, files, strict=True) if f is not None]
+        return digest_of(how, rows) if len(rows) == len(keys) else None
+
+    return [mark(keys) for keys in groups]
 
 
 def _facts(
@@ -204,6 +219,9 @@ def check_usable(
 ) -> None:
     """Refuse what can be refused from names alone, before anything is read or written."""
     check_population(population, allow_single=single_allowed)
+    known = dict.fromkeys(key.episode for key in population.episodes)
+    if unknown := [name for name in test or () if name not in known]:
+        raise DataError(f"split.test: no episode is named {some(unknown)}; there are {some(list(known))}.")
     split_episodes(population, test)
     condition_of(population, identify_on)
 

@@ -119,8 +119,6 @@ def _reasons(row: Record) -> list[str]:
         reasons.append(f"score {row['score']:.2f} dB, threshold {row['threshold']:.2f} dB")
     if row["status"] == Status.NOT_ENOUGH_DATA:
         reasons.append(f"about {row['needed_s']:.3g} s of recordings are needed, found {row['recorded_s']:.3g} s")
-    elif row["status"] == Status.CANNOT_TELL and "missing" not in row and row["units"] < FEWEST_UNITS:
-        reasons.append(f"needs at least {FEWEST_UNITS} units to compare with, has {row['units']}")
     elif row["status"] == Status.OTHER_MOTIONS:
         less = "beyond the others, but by no more than one unit differs from motion to motion"
         reasons.append(f"{less}; repeat the motions of the study")
@@ -130,6 +128,10 @@ def _reasons(row: Record) -> list[str]:
         reasons.append(f"{change}, at {row['detectable_hz']:.3g} Hz")
     if "missing" in row:
         reasons.append(f"no score without {', '.join(row['missing'])}")
+    elif row["status"] == Status.CANNOT_TELL:
+        needs = f"needs about {row['fewest_units']} units that differ as those of the study do, has {row['units']}"
+        none = "no number of units that differ as those of the study do would decide: record more of each, or leave "
+        reasons.append(needs if row["fewest_units"] else f"{none}those out that are unlike the others")
     if row.get("level_db") is not None:
         few = f", from {row['level_units']} units of which {FEWEST_UNITS} are needed"
         place = f"{abs(row['level_db']):.2f} dB {'over' if row['level_db'] > 0 else 'below'} the monitor's bound"

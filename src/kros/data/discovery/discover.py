@@ -200,15 +200,18 @@ def _channel(column: TableColumn) -> Record:
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
     """Return the columns with measured states and inputs as named, where any are named, else as proposed."""
     decided, measured, given = list(columns), ColumnPart.MEASURED, ColumnPart.INPUT
-    for part, names, freed in (
-        (measured, wanted.measured, ColumnPart.STATE),
-        (given, wanted.inputs, ColumnPart.LEFT_OUT),
-    ):
-        places = [_place(decided, name) for name in names]
+    places = {
+        measured: [_place(columns, n) for n in wanted.measured],
+        given: [_place(columns, n) for n in wanted.inputs],
+    }
+    if both := set(places[measured]) & set(places[given]):
+        name = columns[both.pop()].name
+        raise ConfigError(f"Roles: --measured and --input both name the column {name!r}; name it in one of them.")
+    for part, freed in ((measured, ColumnPart.STATE), (given, ColumnPart.LEFT_OUT)):
         for i, column in enumerate(decided):
-            if i in places:
+            if i in places[part]:
                 decided[i] = replace(column, part=part, why="as named")
-            elif places and column.part is part:
+            elif places[part] and column.part is part:
                 decided[i] = replace(column, part=freed)
     for part, what, option in ((measured, "a measured state", "--measured"), (given, "an input", "--input")):
         if not any(c.part is part for c in decided):

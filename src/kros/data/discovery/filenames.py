@@ -9,26 +9,29 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from itertools import chain, groupby
+from typing import Any
 
 from ...core import Names
 from ..population import OUTLIERS
 from ..readers.csv_folder import ENDINGS
 
 UNIT, CONDITION, EPISODE, GROUP = "unit", "condition", "episode", "group"
-_WORDS = {
+_WORDS = {  # that a number follows
     UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder "
     "pump valve design joint sample specimen antrieb maschine geraet gerät pruefling prüfling einheit anlage moteur "
     "variateur part id",
     EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung day "
-    "session versuch lauf aufnahme essai mesure meas nr no",
+    "session versuch lauf aufnahme essai mesure meas nr no rep repetition repeat cyc cycle",
     CONDITION: "condition cond load config mode case temp last bedingung zustand charge",
 }
-_ROLE_OF = {word: role for role, words in _WORDS.items() for word in words.split()}
-_STATES = """
-load loaded noload unloaded idle empty full hot cold warm cool new worn dry wet on off last ohnelast leerlauf leer kalt
-heiss heiß belastet unbelastet mitlast charge vide froid chaud forward reverse
-"""
-_CONDITIONS = set(_STATES.split())
+_STATES = {
+    CONDITION: "load loaded noload unloaded idle empty full hot cold warm cool new worn dry wet on off last ohnelast "
+    "leerlauf leer kalt heiss heiß belastet unbelastet mitlast charge vide froid chaud forward reverse",
+    EPISODE: "sine step chirp sweep prbs ramp random noise multisine sinus sprung rampe rauschen",
+}
+_ROLE_OF, _ROLE_OF_STATE = (
+    {word: role for role, text in table.items() for word in text.split()} for table in (_WORDS, _STATES)
+)
 _MEASURE = re.compile(
     r"^\d+(?:[.,]\d+)?(?:bar|mbar|psi|kpa|degc|°c|c|k|kg|g|n|nm|v|a|rpm|hz|mm|m|percent|pct|%)$", re.IGNORECASE
 )
@@ -101,11 +104,6 @@ def _roles(columns: list[Names], folders: int) -> tuple[Roles, bool]:
         named = next((i for i in same if _by_words(columns, i) == UNIT), None)
         roles = [UNIT if i == named else role for i, role in enumerate(roles)]
     left = [i for i in varying if roles[i] is None]
-    units = [i for i in varying if roles[i] == UNIT] or [i for i in left if len(set(columns[i])) < len(columns[i])]
-    for i in left:  # good/act1, faulty/act3: two labels, and not two units
-        if any(j > i and _nested(columns[i], columns[j]) for j in units):
-            roles[i] = GROUP
-    left = [i for i in left if roles[i] is None]
     if left:
         _by_place(columns, folders, varying, left, roles)
     return _contiguous(roles), not left
@@ -115,56 +113,57 @@ def _numbered(words: Iterable[str]) -> bool:
     return all(re.search(r"\d", word) for word in words)
 
 
-def _nested(outer: Names, inner: Names) -> bool:
-    """Tell whether words without numbers label units: every unit, a numbered word, has one, and a label has several."""
-    values, labels = set(inner), set(outer)
-    apart = _numbered(values) and not any(_numbered([label]) for label in labels)
-    return apart and len(labels) < len(values) == len(set(zip(outer, inner, strict=True)))
-
-
 def _by_words(columns: list[Names], i: int) -> str | None:
     """Return what words say about the words at one place."""
     values = {v.lower() for v in columns[i]}
     if values & {OUTLIERS, "outlier"}:
         return GROUP
-    if len(values & _CONDITIONS) >= max(1, len(values) - 1) or all(_MEASURE.match(v) for v in values):
+    if all(_MEASURE.match(v) for v in values):
         return CONDITION
     plain = {re.sub(r"\d+$", "", v) for v in values}
+    states = list(map(_ROLE_OF_STATE.get, plain))
+    state = next((role for role in _STATES if states.count(role) >= max(1, len(plain) - 1)), None)
     before = columns[i - 1][0].lower() if i and len(set(columns[i - 1])) == 1 else ""
     numbered = plain.pop() if len(plain) == 1 and _numbered(values) else ""
     roles = {_ROLE_OF.get(numbered), _ROLE_OF.get(re.sub(r"s$", "", before))}
-    role = next((role for role in _WORDS if role in roles), None)
+    role = state or next((role for role in _WORDS if role in roles), None)
     return role or (EPISODE if all(_DATE.match(v) for v in columns[i]) else None)
 
 
 def _by_place(columns: list[Names], folders: int, varying: Sequence[int], left: Sequence[int], roles: Roles) -> None:
-    """Set the roles that no word tells: units before conditions before episodes."""
-    if UNIT not in roles:  # what differs in every file is no machine, unless nothing else differs
-        repeated = [i for i in left if len(set(columns[i])) < len(columns[i]) or varying == [i]]
-        # hall1/crane1/run1: the folder of a set of runs
-        above = [i for i in repeated if i < folders and _numbered(columns[i]) and EPISODE in roles[i:]]
-        for i in (above or repeated[:1])[-1:]:
+    """Set the roles that no word tells: of numbered words units before episodes, of labels groups and conditions."""
+    numbered = [i for i in left if _numbered(columns[i])]
+    if UNIT not in roles:  # what differs in every file is no machine, unless it is all that no word tells
+        alone = EPISODE not in roles and len(left) == 1
+        repeated = [i for i in left if alone or len(set(columns[i])) < len(columns[i])]
+        counted = [i for i in repeated if i in numbered]
+        above = [i for i in counted if i < folders and EPISODE in roles[i:]]  # hall1/crane1/run1: a folder of runs
+        spelled = [i for i in counted if not all(map(str.isdecimal, columns[i]))]
+        named = [i for i in spelled if EPISODE in roles or i < left[-1]]  # heavy_KX1041_1
+        labelled = [j for i in set(repeated) - set(counted) for j in counted if _share(columns[i], columns[j]) == GROUP]
+        for i in (above[-1:] or named or labelled or repeated)[:1]:
             roles[i] = UNIT
-    for i in reversed([i for i in left if roles[i] is None]):
-        before = UNIT in roles[i + 1 :] and not any(roles[i + 1 : roles.index(UNIT, i + 1)])
-        labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
-        roles[i] = UNIT if labels else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
-        if before and _numbered(columns[i]):  # batch2/motor7: the batch is part of the name
-            roles[i] = UNIT
-        elif before:
-            roles[i] = EPISODE if CONDITION in roles else CONDITION
+    units = list(zip(*(c for c, role in zip(columns, roles, strict=True) if role == UNIT), strict=True))
+    for i in sorted((i for i in left if roles[i] is None), key=lambda i: (i not in numbered, -i)):
+        share = None if i in numbered or not units else _share(columns[i], units)
+        if share is None or (share == CONDITION and EPISODE not in roles):  # batch2/motor7: the batch is part of a name
+            share = UNIT if next((roles[j] for j in varying if j > i), None) == UNIT else EPISODE
+        roles[i] = share
+
+
+def _share(labels: Sequence[Any], units: Sequence[Any]) -> str | None:
+    """Return what labels of units are: groups of them, or conditions that several have in common."""
+    pairs, own, of = (len(set(words)) for words in (zip(labels, units, strict=True), labels, units))
+    if pairs == of > own:
+        return GROUP
+    return CONDITION if pairs > max(own, of) else None
 
 
 def _contiguous(roles: Roles) -> Roles:
     """Keep of every role one stretch of places, with text between; others become episodes, or are not needed."""
     for role in (GROUP, UNIT, CONDITION, EPISODE):
-        runs: list[list[int]] = [[]]
-        for i, r in enumerate(roles):
-            if r == role:
-                runs[-1].append(i)
-            elif r is not None:
-                runs.append([])
-        runs = [run for run in runs if run]
+        named = [i for i, r in enumerate(roles) if r is not None]
+        runs = [list(run) for r, run in groupby(named, key=roles.__getitem__) if r == role]
         if runs:
             places = runs.pop(-1 if role is EPISODE else 0)
             roles[places[0] : places[-1] + 1] = [role] * (places[-1] + 1 - places[0])

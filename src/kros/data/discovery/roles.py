@@ -2,45 +2,20 @@
 
 from __future__ import annotations
 
-import re
-import unicodedata
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 
 import numpy as np
 
 from ...core import Array, frozen
-from ..measures import KINDS, ZERO_OF_CELSIUS, Measure, clean_unit, measure, split_header
+from ..measures import ZERO_OF_CELSIUS, Measure, clean_unit, identifier, kind_of, measure, split_header, words_of
 from ..readers.tables import Table, stretches
 
-WORDS = {
-    "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl ref reference "
-    "sollgeschwindigkeit consigne con ctrl control input inputs pwm duty stell stellgroesse stellwert feedforward "
-    "demand demanded set vorgabe commande u",
-    "spare": "filt filtered smooth smoothed index idx sample samples counter count nr no number status flag error err "
-    "saturation sat mode id fault fehler zaehler",
-    "time": "time zeit t timestamp timestamps date datum uhrzeit clock temps tijd tiempo tempo secs seconds millis "
-    "datetime zeitstempel",
-    "angle": "angle winkel theta phi alpha beta gamma q encoder enc rotation drehwinkel angolo",
-    "position": "pos position lage weg stroke hub displacement x y z istposition posizione travel",
-    "velocity": "vel velocity speed drehzahl geschwindigkeit omega rpm rate v w dq qd vitesse istdrehzahl velocita",
-    "acceleration": "acc accel acceleration beschleunigung",
-    "current": "current strom i iq courant amp amps corrente motorstrom",
-    "torque": "torque tau moment drehmoment couple coppia",
-    "force": "force kraft f effort forza",
-    "pressure": "pressure druck p pression oeldruck",
-    "temperature": "temp temperature temperatur",
-    "voltage": "volt voltage spannung tension",
-}
-_OF_WORD = {word: kind for kind, words in WORDS.items() for word in words.split()}
 UNKNOWN = "not recognised"
 Samples = Mapping[int, Sequence[Array]]  # of columns by their place, from several episodes
 _STATES = ("angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration")
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
-_LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
-_SPELLED = dict(zip("äöüßÄÖÜΔωφθατ", _LETTERS.split(), strict=True))
-
 
 LABELS = {
     "unit": "unit serial number sn id name device machine motor drive rig sample specimen cell dut uut asset maschine "
@@ -82,18 +57,6 @@ class TableColumn:
         return self.header if self.alone else self.at + 1
 
 
-def identifier(text: str, taken: Collection[str] = ()) -> str:
-    """Return a name for a channel that may stand in formulas and in C source, as close to the header as can be."""
-    if text.isidentifier() and text.isascii() and text not in taken:
-        return text
-    spelled = "".join(_SPELLED.get(letter, letter) for letter in text)
-    ascii_text = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode().lower()
-    name = re.sub(r"\W+", "_", ascii_text).strip("_") or "channel"
-    name = name if name[0].isalpha() else f"c{name}"
-    numbered = (f"{name}_{n}" for n in range(2, len(taken) + 3))
-    return next(n for n in (name, *numbered) if n not in taken)
-
-
 def describe(table: Table) -> list[TableColumn]:
     """Return the columns that have a header, or all where there is none, without parts."""
     columns = list[TableColumn]()
@@ -111,21 +74,6 @@ def describe(table: Table) -> list[TableColumn]:
         alone = table.dialect.header and table.fields.count(header) == 1
         columns.append(TableColumn(header, name, *about, at=i, alone=alone))
     return columns
-
-
-def _kinds_of(name: str) -> list[str]:
-    """Return the kinds that the words of a name stand for, with nothing for words that are not known."""
-    apart = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
-    words = identifier(f"{apart} ").lower().split("_")
-    return [_OF_WORD.get(re.sub(r"\d+$", "", word), "input" if word.startswith("soll") else "") for word in words]
-
-
-def kind_of(name: str, unit: str = "") -> str:
-    """Return the kind of quantity that a channel is, by its unit of measure or its name, or nothing."""
-    known = measure(unit)
-    kind = "other" if known is None else KINDS[known.si]
-    quantities = (of for of in _kinds_of(name) if of not in ("", "input", "spare"))
-    return next(quantities, "") if kind == "other" else kind
 
 
 def time_columns(columns: Sequence[TableColumn], samples: Samples) -> list[TableColumn]:
@@ -181,12 +129,12 @@ def _spare(column: TableColumn, signals: Sequence[Array]) -> str:
         return "counts the samples"
     if column.kind == "time" and all(_rises(s) for s in signals):
         return "a second column of time"
-    return "by its name" if "spare" in _kinds_of(column.name) else ""
+    return "by its name" if "spare" in words_of(column.name) else ""
 
 
 def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
     """Return the part that the name and the unit of measure of a column speak for, and why."""
-    if "input" in _kinds_of(split_header(column.header)[0]) or column.kind == "voltage":
+    if "input" in words_of(split_header(column.header)[0]) or column.kind == "voltage":
         return ColumnPart.INPUT, "a command or a voltage, by name and unit"
     if column.kind in _STATES:
         return ColumnPart.STATE, f"{column.kind}, by name or unit"

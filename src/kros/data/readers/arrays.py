@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ...core import Array, ByName, DataError, frozen, shortened
+from ...core import Array, ByName, DataError, did_you_mean, frozen, shortened
 from ...core.arrays import as_numbers
 from ..population import DEFAULT_CONDITION, Channel, Channels, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
-from ..recording import Recording, Recordings, check_period, check_structure, title
+from ..recording import Recording, Recordings, check_increasing, check_period, check_structure, title
 
 
 @frozen
@@ -180,7 +180,7 @@ def from_frame(
     Raises
     ------
     DataError
-        A missing column, ids that are not text or whole numbers, uneven time.
+        A missing column, ids that are not text or whole numbers, time that runs back or is uneven.
 
     Examples
     --------
@@ -199,8 +199,9 @@ def from_frame(
         raise DataError(f"from_frame needs one of time and sample_period_s, {actual}.")
     ordered, known = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame")), list(frame)
     for name in filter(None, (*(c.name for c in ordered), time, unit)):
-        if known.count(name) != 1:
-            raise DataError(f"from_frame: column {name!r} occurs {known.count(name)} times in {known}; rename it.")
+        if (count := known.count(name)) != 1:
+            problem = f"occurs {count} times;" if count else f"is missing{did_you_mean(name, known) or ';'}"
+            raise DataError(f"from_frame: column {name!r} {problem} the columns are {known}; correct the name.")
     numbers = np.column_stack([_column(frame, c.name) for c in ordered])
     times = None if time is None else _column(frame, time)
     ids = _ids(frame, unit, None), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0")
@@ -208,7 +209,10 @@ def from_frame(
     for row, key in enumerate(map(EpisodeKey, *ids)):
         rows.setdefault(key, []).append(row)
     places = {key: (numbers[at], None if times is None else times[at]) for key, at in rows.items()}
-    return assemble(ArrayRecordings(places), ordered, sample_period_s=sample_period_s)
+    recordings = ArrayRecordings(places)
+    for key in places:
+        check_increasing(recordings(key), " in the frame")
+    return assemble(recordings, ordered, sample_period_s=sample_period_s)
 
 
 def _ids(frame: Any, column: str | None, default: str | None) -> list[str]:

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from ...core import Array, Parameters, frozen
-from ...data import EpisodeBatch, hold_missing
+from ...data import EpisodeBatch
 
 
 @frozen
@@ -70,3 +70,13 @@ def _explained(rate: Array, state: Array) -> float:
 def cutoffs_hz(sample_period_s: float) -> Array:
     """Return the cut-offs that are tried, log-spaced from a thousandth to nearly half of the sampling frequency."""
     return np.geomspace(1e-3, 0.45, 24) / sample_period_s
+
+
+def hold_missing(y: Array) -> Array:
+    """Return measurements, (n_samples, ...), with the last that arrived for those that are missing, zero before it."""
+    there = np.isfinite(y)
+    if there.all():
+        return y
+    shape = (-1, *[1] * (y.ndim - 1))
+    last = np.maximum.accumulate(np.where(there, np.arange(len(y)).reshape(shape), 0), axis=0)
+    return np.take_along_axis(np.where(there, y, 0.0), last, axis=0)

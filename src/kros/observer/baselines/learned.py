@@ -16,7 +16,8 @@ from collections.abc import Collection, Iterable, Sequence
 import numpy as np
 
 from ...core import TINY, Array, Columns, DataError, Names, Parameters, Whole, frozen
-from ...data import EpisodeBatch, hold_missing
+from ...data import EpisodeBatch
+from .difference import hold_missing
 
 
 @frozen

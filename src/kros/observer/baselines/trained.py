@@ -8,7 +8,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ...core import AnyArray, Array, DataError, MissingDependencyError, Parameters, frozen
-from ...data import EpisodeBatch, hold_missing
+from ...data import EpisodeBatch
+from .difference import hold_missing
 
 Regressor = Literal["boosting", "network"]
 

@@ -41,7 +41,7 @@ def check_units(run: Path, data: Path, workers: int, same_unit: bool) -> Rows:
 def verdicts(context: Context, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:
     """Do the same in a run that is open."""
     rows = scored(context, data, workers, same_unit)
-    return [plain(with_verdict(row)) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
+    return [with_verdict(plain(row)) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
 
 
 def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
@@ -116,7 +116,7 @@ def score_condition(
         level = None if recorded.same_motions(factor) else motion
         score = recorded.qualified(outliers.score(unit, response, known, level), evidence)
         row = score_row(score, condition, len(keys), float(factor.n_samples.sum()) * models.sample_period_s)
-        rows.append(row | {"units": outliers.n_units, "left_out": sorted(known)})
+        rows.append(row | {"units": len(set(outliers.unit_ids) - known), "left_out": sorted(known)})
     return rows
 
 

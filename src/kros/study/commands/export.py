@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core import ConfigError, KrosError, write_json
-from ...data.discovery.roles import identifier
+from ...data.measures import identifier
 from ...evaluate.sensor import Arriving, arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
 from ...loops.compiler import find_compiler

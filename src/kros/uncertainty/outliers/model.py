@@ -92,11 +92,12 @@ class OutlierModel(Storable):
             raise DataError(f"Scoring unit {unit}: {len(rows)} others are left, two are needed; record more units.")
         G = check_responses([*self.responses[:1], response], ("those scored", unit), self.freqs_hz)[1]
         comparison = self._comparison(rows, G / self.output_scale[:, None] * self.input_scale)
-        margin = -np.inf
-        if self.n_units >= OUTLIER.fewest:
-            levels = comparison.distances.levels
-            margin = float(margins(levels, comparison.inliers, self.false_alarm_rate)[1][-1])
+        both = margins(comparison.distances.levels, comparison.inliers, self.false_alarm_rate)
+        value, beyond = (float(of[-1]) for of in both)
+        margin = beyond if self.n_units >= OUTLIER.fewest else -np.inf
         (score,) = comparison.scores((unit,), self.threshold_db, {len(rows): margin})
+        fewest = comparison.fewest_units(score, value - beyond, self.false_alarm_rate)
+        score = replace(score, fewest_units=fewest)
         level = comparison.distances.levels[-1]
         motion = 0.0 if motion_db is None else 10 ** (motion_db / 20)
         beyond = np.maximum(10 ** (level / 20) - motion, OUTLIER.least)

@@ -6,6 +6,7 @@ nothing is said about the unit instead of "ok".
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
@@ -16,7 +17,7 @@ from ...core import AnyArray, Flags, frozen
 from ..forms import Form, evenly
 from ..settings import OUTLIER
 from .distances import Distances, scaled_levels
-from .tail import excesses
+from .tail import excesses, factor
 
 # below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
 FEWEST_UNITS = OUTLIER.fewest
@@ -26,9 +27,9 @@ class Status(StrEnum):
     """What the recordings say about a unit.
 
     ``ok``: a change of the size that stands beside it would have been flagged. ``outlier``: flagged. ``not enough
-    data``: too few recordings of this unit. ``cannot tell``: fewer than eight units to compare with, or too unlike
-    ones. ``other motions``: beyond the others, but by no more than one unit differs from motion to motion, and its
-    motions are none of theirs.
+    data``: too few recordings of this unit. ``cannot tell``: too few units to compare with, or too unlike ones.
+    ``other motions``: beyond the others, but by no more than one unit differs from motion to motion, and its motions
+    are none of theirs.
     """
 
     OK = "ok"
@@ -58,6 +59,7 @@ class OutlierScore:
     detectable_percent: float = float("inf")  # smallest change of gain of one entry that would be flagged, first order
     detectable_hz: float | None = None  # where that is; None where nothing could be flagged
     more_data: float = 1.0  # how many times as long the unit would have to be recorded; one where recordings suffice
+    fewest_units: int | None = None  # that would decide, were they as unlike as these; none where no number would
 
 
 @frozen
@@ -92,14 +94,24 @@ class Comparison:
 
     def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:
         """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
-        cover = float(self.distances.levels[unit].max()) - score.excess_db
-        percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
-        percent = percent.min(axis=(0, 1))
+        percent = self._percent(score, unit, bound_db)
         smallest, hz = float(percent.min()), float(self.freqs_hz[percent.argmin()])
         shows = bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent
         inlier = Status.OK if shows else Status.CANNOT_TELL
         status = Status.OUTLIER if score.outlier else inlier
         return replace(score, status=status, detectable_percent=smallest, detectable_hz=hz)
+
+    def _percent(self, score: OutlierScore, unit: int, bound_db: float) -> AnyArray:
+        """Return the change of gain, at each frequency, that is an excess of the bound."""
+        cover = float(self.distances.levels[unit].max()) - score.excess_db
+        return OUTLIER.percent * 10 ** ((cover + bound_db - self._changes.max(axis=(0, 1))) / 20)
+
+    def fewest_units(self, score: OutlierScore, bound_db: float, rate: float) -> int | None:
+        """Return how many inliers would decide on the last unit, which has a bound by these, or None."""
+        smallest = self._percent(score, -1, bound_db).min()
+        largest = min(OUTLIER.largest_db, bound_db + 20 * np.log10(OUTLIER.largest_percent / smallest))
+        share = factor(int(self.inliers.sum()), rate) * largest / bound_db
+        return next((n for n in range(OUTLIER.fewest, math.ceil(1 / rate)) if factor(n, rate) <= share), None)
 
     @cached_property
     def _changes(self) -> AnyArray:

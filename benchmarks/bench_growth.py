@@ -37,7 +37,7 @@ def models(units: int, lifted: int) -> Work:
 
 def refinement(units: int) -> Work:
     """Simulated drives, three episodes of 5 s each, the linear model."""
-    from kros.identify import combine, episode_factors
+    from kros.identify import unit_factors
     from kros.lifting import Lifting
     from kros.plants import HarmonicDrivePopulation
 
@@ -49,7 +49,7 @@ def refinement(units: int) -> Work:
     )
     keys = {unit: [key for key in population.episodes if key.unit == unit] for unit in population.unit_ids}
 
-    factor = combine(episode_factors(population, keys, linear))
+    factor = unit_factors(population, keys, linear)
     return lambda: refine_population(population, keys, linear, {}, factor)
 
 

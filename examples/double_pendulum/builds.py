@@ -16,7 +16,7 @@ import numpy as np
 
 import kros
 from kros.data import Channel, EpisodeKey, Population, Role
-from kros.identify import KoopmanMatrices, combine, edmd, episode_factors, free_run, smallest_stabilising_alpha
+from kros.identify import KoopmanMatrices, edmd, free_run, smallest_stabilising_alpha, unit_factors
 from kros.identify.refine import RefineOptions, refine_population
 from kros.lifting import Lifting
 
@@ -70,7 +70,7 @@ def training(recordings: Recordings, design: tuple[str, ...]) -> Population:
 def fit(population: Population) -> dict[str, KoopmanMatrices]:
     """Fit the builds of one design: by least squares, and refined on free runs, all together first, then each with a prior."""
     keys = {unit: population.keys(unit) for unit in population.unit_ids}
-    factor = combine(episode_factors(population, keys, LIFTING))
+    factor = unit_factors(population, keys, LIFTING)
     alpha = 4 * smallest_stabilising_alpha([(factor.R, LIFTING.n_lifted)])
     refined = refine_population(population, keys, LIFTING, {}, factor, options=OPTIONS)
     return {"refined": refined, "EDMD": edmd(factor.R, LIFTING.n_lifted, alpha)}

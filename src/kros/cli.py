@@ -28,7 +28,8 @@ FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
 _SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _USAGE = [kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"]  # perhaps typer's own
 _PASSED: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_USAGE)
-_BAD_INPUT = (ConfigError, DataError, DimensionError, MissingDependencyError)
+_PLACE = (PermissionError, FileExistsError, NotADirectoryError)  # of what somebody named
+_BAD_INPUT = (ConfigError, DataError, DimensionError, MissingDependencyError, *_PLACE)
 
 
 class EdgeGroup(TyperGroup):
@@ -60,7 +61,7 @@ def edge(ctx: Any) -> Iterator[None]:
     except Exception as error:
         _silence_if_broken()
         typer.echo(f"kros: {message(error)}".encode(errors="backslashreplace").decode(), err=True)
-        raise typer.Exit(BAD_INPUT if isinstance(error, _BAD_INPUT) else FAILED) from error
+        raise typer.Exit(BAD_INPUT if isinstance(error, _BAD_INPUT) else FAILED) from None  # for any cause
 
 
 @contextlib.contextmanager
@@ -334,7 +335,7 @@ def watch(
     folder: Annotated[Path, _argument("FOLDER", "Where recordings arrive.")],
     run_folder: Run,
     out: Annotated[Path | None, _option("Folder of results; default: FOLDER-results.")] = None,
-    every: Annotated[float, _option("Time between two looks; a file that grows is waited for.", metavar="S")] = 2.0,
+    every: Annotated[float, _option("Time between two looks; growing files wait.", metavar="S", min=0)] = 2.0,
     once: Annotated[bool, _option("End when everything that is there has a result.", "--once")] = False,
 ) -> None:
     """Check new recordings as they arrive: a line and a result file each, never lost over restarts."""

@@ -65,6 +65,7 @@ def said(result, code, *words):
         (MemoryError(), ("Memory", "--workers")),
         (KeyError("alpha"), ("Internal error", "KeyError", "--debug")),
         (RecursionError("too deep"), ("Internal error",)),
+        (StopIteration(), ("Internal error",)),
         (ZeroDivisionError("division by zero"), ("Internal error", "division by zero")),
         (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed"), ("Internal error",)),
     ],
@@ -91,7 +92,8 @@ def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command,
     }
     arguments = {"run": 1, "report": 1, "check": 2, "estimate": 3, "figures": 2, "simulate": 1, "init": 1, "list": 1}
     monkeypatch.setattr(places[command], fail)
-    said(kros(command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))]), 1, *words)
+    code = 2 if isinstance(error, PermissionError | NotADirectoryError) else 1  # a place that somebody named
+    said(kros(command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))]), code, *words)
     debugged = kros("--debug", command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))])
     assert debugged.exception is error
 

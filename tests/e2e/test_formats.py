@@ -178,7 +178,7 @@ def test_files_of_a_library_are_found_and_read_in_si(kros, tmp_path, motors, end
     assert (len(found.measured), len(found.states), len(found.inputs)) == (1, 3, 1)
     order = [next(i for i, n in enumerate(NAMES) if n in c.name or f"data_{i + 1}" in c.name) for c in found.channels]
     factors = [RECORDED[NAMES[i]][1] for i in order] if ros else np.ones(4)
-    units = ["rad", "rad/s", "A", "" if "mat" in ending else "V"]
+    units = ["rad", "rad/s", "A", "V"]
     assert [c.unit for c in found.channels] == [units[i] if not ros else "" for i in order]
     for ours, theirs in zip(found.episodes, motors.episodes, strict=True):
         np.testing.assert_allclose(found.read(ours) * factors, motors.read(theirs)[:, order], rtol=1e-12, atol=1e-14)

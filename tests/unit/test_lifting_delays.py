@@ -5,7 +5,6 @@ import pytest
 from random_models import random_observer
 
 from kros.core.errors import ConfigError, DataError, DimensionError, IdentificationError
-from kros.data import Channel, EpisodeBatch, EpisodeKey, Role, from_arrays
 from kros.identify import combine, edmd, free_run
 from kros.identify.factors import Factor, lifted_factor, reduce_episode, require_excitation
 from kros.lifting import Lifting
@@ -147,20 +146,6 @@ def test_batched_and_single_observers_equal_the_equations(injection, order):
         running = o.start(y[0, i], {"phase": phase})
         stepped = [running.estimate] + [running.step(y[k, i], u[k, i]) for k in range(29)]
         np.testing.assert_allclose(stepped, x[3:], rtol=1e-10, atol=1e-10)
-
-
-def test_free_runs_start_from_the_first_recorded_samples():
-    rng = np.random.default_rng(8)
-    channels = [Channel(n, Role.STATE, "", True) for n in STATES] + [Channel(n, Role.INPUT) for n in INPUTS]
-    values = {str(i): rng.normal(size=(length, 4)) for i, length in enumerate((30, 20))}
-    episodes = {EpisodeKey("1", "default", name): signals for name, signals in values.items()}
-    population = from_arrays(episodes, channels, 0.01)
-    batch = EpisodeBatch.read(population, population.episodes)
-    np.testing.assert_array_equal(batch.first_states(DELAYED.history)[1], values["1"][:4, :2])
-    np.testing.assert_array_equal(batch.first_states(), batch.states[0])
-    short = EpisodeBatch.read(population, population.episodes, 3)
-    with pytest.raises(DataError, match=r"episode 0 of unit 1 .*: needs 4 samples for delays of up to 3, found 3"):
-        short.first_states(DELAYED.history)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError
-from kros.core.frequency import check_grid, log_grid, nyquist_hz
+from kros.core.frequency import log_grid, nyquist_hz
+from kros.uncertainty.forms import check_grid
 from kros.uncertainty.weights.sections import bilinear_squared
 
 DT = 1e-3

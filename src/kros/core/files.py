@@ -44,7 +44,7 @@ def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) 
         raise error(f"Reading {path}: {failure}; check the path and the permissions.") from failure
     if not stat.S_ISREG(status.st_mode):
         found = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device"
-        raise error(f"Reading {path}: a regular file is needed, found {found}; copy its content to a file first.")
+        raise error(f"Reading {path}: a regular file is needed, found {found}; name a file.")
     if status.st_size > limit:
         advice = "split it, or raise the limit in kros.core.limits"
         raise error(f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; {advice}.")

@@ -84,6 +84,8 @@ Random Fourier features are no longer a family of liftings; use radial, with cen
     kros.lifting: fourier_features
 Resampled models are no longer public; kros.quantify and the report use them by themselves.
     kros.identify: ModelSamples bootstrap_edmd episode_weights
+Factors of single episodes are no longer public; use unit_factors, which takes the same arguments.
+    kros.identify: episode_factors
 The residual-shaped observer is no longer a public function; use kros.synthesize with the method residual_h2.
     kros.synthesis: ResidualProblem residual_h2
 Undeclared disturbances are no longer simulated; remove the key, and see sensor_gains under deployment in metrics.json.

@@ -5,8 +5,9 @@ from __future__ import annotations
 from enum import Enum
 from typing import Any, Self, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
+from . import limits
 from .arrays import T
 from .errors import ConfigError
 from .files import did_you_mean, shortened
@@ -27,11 +28,23 @@ class Settings(BaseModel):
         try:
             return cls.model_validate(raw)
         except ValidationError as error:
-            problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {cls._explain(e)}" for e in error.errors())
+            texts = (f"{'.'.join(map(str, e['loc']))}: {cls._explain(e)}" for e in error.errors())
+            problems = "; ".join(text.removeprefix(": ") for text in texts)
             raise ConfigError(f"{asked}: {shortened(problems, 2000)}.") from error
         except _OF_FAMILIES as error:
             reason = f"{type(error).__name__}: {shortened(str(error))}"
             raise ConfigError(f"{asked}: {reason}; check the values of [[lifting.families]].") from error
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _sized(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse truth values where numbers are asked for, and numbers that nothing can be computed with."""
+        kind = cls.model_fields[info.field_name or ""].annotation
+        if isinstance(value, bool) and bool not in (kind, *get_args(kind)):
+            raise ValueError("input should not be true or false")
+        if isinstance(value, int | float) and abs(value) > limits.MAX_VALUE:
+            raise ValueError(f"input should be at most {limits.MAX_VALUE:g} in size")
+        return value
 
     @classmethod
     def _explain(cls, error: Any) -> str:

@@ -124,16 +124,6 @@ class EpisodeBatch:
         parts = {name: None if signal is None else signal[part] for name, signal in signals.items()}
         return parts | {"inputs": np.ascontiguousarray(parts["inputs"])}
 
-    def first_states(self, history: int = 0) -> Array:
-        """Return the first states of every episode, (batch, n), or (batch, history + 1, n) with delays."""
-        if not history:
-            return self.states[0]
-        for key, length in zip(self.keys, self.lengths, strict=True):
-            if length < history + 1:
-                needs = f"needs {history + 1} samples for delays of up to {history}, found {length}"
-                raise DataError(f"Simulation of {key}: {needs}; leave the episode out.")
-        return np.swapaxes(self.states[: history + 1], 0, 1)
-
 
 def _side_by_side(episodes: Sequence[Array], lengths: Whole) -> Array:
     """Return episodes as one array, shape (n_samples, batch, n_columns), shorter ones held at their last sample."""

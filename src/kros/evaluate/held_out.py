@@ -79,7 +79,8 @@ class HeldOut:
         def run(batch: EpisodeBatch) -> list[Array]:
             rows = [models.index(k.unit) for k in batch.keys]
             values = batch.parameters if models.lifting.parameters else {}
-            first, inputs = batch.first_states(models.lifting.history), np.swapaxes(batch.inputs, 0, 1)
+            x, inputs = np.swapaxes(batch.states, 0, 1), np.swapaxes(batch.inputs, 0, 1)
+            first = x[:, : models.lifting.history + 1]
             states = free_run(models.A[rows], models.B[rows], models.lifting, values, first, inputs)
             return [np.swapaxes(states, 0, 1)[None]]
 

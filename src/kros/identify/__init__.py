@@ -16,7 +16,7 @@ from types import ModuleType
 from ..core import refusing
 from .calibration import PhaseCalibration, PhaseSpec
 from .edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
-from .factors import Factor, combine, episode_factors
+from .factors import Factor, combine, unit_factors
 from .free_run import free_run
 from .identified import IdentifiedModels
 from .identify import identify
@@ -31,10 +31,10 @@ __all__ = [
     "PhaseSpec",
     "combine",
     "edmd",
-    "episode_factors",
     "free_run",
     "identify",
     "smallest_stabilising_alpha",
+    "unit_factors",
 ]
 
 

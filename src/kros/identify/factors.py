@@ -27,9 +27,12 @@ import numpy as np
 from ..core import ROUNDING, Array, ArrayLike, DataError, IdentificationError, Whole, frozen
 from ..core.linalg import qr_triangle
 from ..data import EpisodeKey, Population
+from ..data.recording import usable
 from ..lifting import Lifting
 from ..lifting.window import FormulaSeparation
 from .edmd import KoopmanMatrices, edmd
+
+Task = tuple[Population, Sequence[EpisodeKey], Lifting]  # episodes of one unit
 
 log = logging.getLogger(__name__)
 _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
@@ -61,11 +64,10 @@ class Factor:
     @classmethod
     def stack(cls, factors: Sequence[Factor]) -> Factor:
         """Stack factors along a new first axis."""
-        ranges = [f.input_range for f in factors if f.input_range is not None]
-        R, peak, n_samples = (np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples"))
-        return cls(R, peak, n_samples, np.stack(ranges) if len(ranges) == len(factors) else None)
+        return cls(*(np.stack([getattr(f, name) for f in factors]) for name in vars(factors[0])))
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
     """Reduce one episode to its factor: states x (n_samples, n) and inputs u (n_samples, m)."""
     lifting.window.require(len(x), beyond=1)
@@ -73,6 +75,8 @@ def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
     x, u = x[lifting.history :], u[lifting.history :]
     g = lifting.separation.evaluate(window)
     v = lifting.input_separation.evaluate(window, u) if lifting.input_functions else u[:, :0]
+    if wrong := [f for f, values in zip(lifting.separation.basis, g.T, strict=True) if not usable(values).all()]:
+        raise DataError(f"{wrong[0]} is not finite, or huge; use functions that are moderate on all recordings.")
     now = np.concatenate([x.T, g.T, u.T, v.T])  # a signal a row: extremes and reflections run along memory
     data = np.concatenate([now[:, :-1], now[: x.shape[1] + g.shape[1], 1:]])
     least, most, inputs = now.min(axis=1), now.max(axis=1), slice(x.shape[1] + g.shape[1], now.shape[0] - v.shape[1])
@@ -106,38 +110,33 @@ def combine(factors: Factor) -> Factor:
     return Factor(qr_triangle(stacked), factors.peak.max(axis=-2), factors.n_samples.sum(axis=-1), span)
 
 
-def episode_factors(
-    population: Population,
-    keys: Mapping[str, Sequence[EpisodeKey]],
-    lifting: Lifting,
-    parameters: Mapping[str, ArrayLike] | None = None,
-) -> Factor:
-    """Return factors of [Psi | Theta_plus] of every episode, for leaving episodes out and for drawing them again.
+def reduce_episodes(task: Task) -> Factor:
+    """Reduce every episode of a task to its factor, stacked on the first axis."""
+    population, keys, lifting = task
+    factors = []
+    for key in keys:
+        try:
+            factors.append(reduce_episode(*population.read_parts(key), lifting))
+        except DataError as error:
+            raise DataError(f"Identifying from {key}: {error}") from error
+    return Factor.stack(factors)
 
-    The batch is (unit, episode) in the order of `keys`, zero where a unit has fewer episodes than others; `parameters`
-    of the lifting have the shape (unit,). Without any episode a DataError is raised.
+
+def unit_factors(population: Population, keys: Mapping[str, Sequence[EpisodeKey]], lifting: Lifting) -> Factor:
+    """Return the factors of [Psi | Theta_plus] of units from their episodes, with a lifting without parameters.
 
     Examples
     --------
     >>> import kros
-    >>> from kros.identify import episode_factors
+    >>> from kros.identify import edmd, unit_factors
     >>> from kros.lifting import Lifting
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
-    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
-    >>> episode_factors(motors, keys, Lifting(motors.states)).R.shape[:2]
-    (2, 3)
+    >>> factor = unit_factors(motors, {unit: motors.keys(unit) for unit in motors.unit_ids}, Lifting(motors.states))
+    >>> edmd(factor.R, len(motors.states), alpha=1.0).A.shape
+    (2, 3, 3)
     """
-    most = max((len(episodes) for episodes in keys.values()), default=0)
-    if most == 0:
-        raise DataError(
-            f"Factors by episode: {len(keys)} units without an episode; pass keys as population.keys(unit) gives them."
-        )
-    rows = [[reduce_episode(*population.read_parts(key), lifting) for key in episodes] for episodes in keys.values()]
-    values = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
-    first = next(f for row in rows for f in row)
-    none = Factor(np.zeros_like(first.R), np.zeros_like(first.peak), np.zeros_like(first.n_samples))
-    padded = [Factor.stack(row + [none] * (most - len(row))) for row in rows]
-    return lifted_factor(Factor.stack(padded), lifting, values, lifting)
+    units = [combine(reduce_episodes((population, episodes, lifting))) for episodes in keys.values()]
+    return lifted_factor(Factor.stack(units), lifting, {}, lifting)
 
 
 def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array], model: Lifting) -> Factor:

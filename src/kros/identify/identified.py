@@ -183,5 +183,5 @@ def recordings_of(folder: Path) -> Population:
 
 def recordings_path(folder: Path) -> Path:
     """Return where the recordings of a run folder, or of a saved result, are."""
-    content: dict[str, Any] = load_artifact(folder / "population", "facts")[0]
+    content, _ = load_artifact(folder / "population", "facts")
     return folder / str(content["recordings"])  # an absolute path stays as it is

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, DataError, Flags, IdentificationError, Work, digest_of, frozen, require_kind
+from ..core import Array, Flags, IdentificationError, Work, digest_of, frozen, require_kind
 from ..core.linalg import radius_text
-from ..data import EpisodeKey, Population
+from ..data import Population
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
-from .factors import Factor, Ranges, combine, lifted_factor, reduce_episode, require_excitation
+from .factors import Factor, Ranges, Task, combine, lifted_factor, reduce_episodes, require_excitation
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
@@ -32,7 +32,6 @@ from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
 from .survey import RecordingFacts, check_usable, survey
 
 log = logging.getLogger(__name__)
-Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
 
 
 def identify(
@@ -147,18 +146,6 @@ def _mark(facts: RecordingFacts, task: Task) -> str:
     """Return what the factors of a task follow from: samples, channels, and the lifting without parameters' values."""
     population, keys, lifting = task
     return digest_of(facts.marks(keys), keys, population.channels, repr(lifting))
-
-
-def reduce_episodes(task: Task) -> Factor:
-    """Reduce every episode of a task to its factor, stacked on the first axis."""
-    population, keys, lifting = task
-    factors = []
-    for key in keys:
-        try:
-            factors.append(reduce_episode(*population.read_parts(key), lifting))
-        except DataError as error:
-            raise DataError(f"Identifying from {key}: {error}") from error
-    return Factor.stack(factors)
 
 
 @frozen

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
@@ -52,15 +52,8 @@ class IdentifySettings(Settings):
     peak residual exceeds one half.
     """
 
-    alpha: float | Literal["auto"] = Field(
+    alpha: Annotated[float, Field(ge=0)] | Literal["auto"] = Field(
         "auto",
         description="regularisation of channels divided by their ranges; a number: of recorded units, as in the paper",
     )
     refine: bool = Field(True, description="models refined on their free-run error, in place of those of the paper")
-
-    @field_validator("alpha")
-    @classmethod
-    def _not_negative(cls, value: float | str) -> float | str:
-        if isinstance(value, float) and value < 0:
-            raise ValueError("alpha should be 'auto' or a number of at least 0")
-        return value

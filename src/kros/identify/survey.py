@@ -73,8 +73,7 @@ class RecordingFacts(Storable):
 
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
-        content: dict[str, Any] = divided(self)[0]
-        return content
+        return dict(divided(self)[0])
 
 
 @dataclass(frozen=True)
@@ -189,14 +188,14 @@ def _facts(
         needs = f"every episode needs at least {options.fewest} samples after preparation"
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
     train, test = (tuple(k for s in splits.values() for k in getattr(s, name)) for name in _PARTS)
-    digests = {e.key: e.digest for e in episodes}
+    digests, measured = {e.key: e.digest for e in episodes}, retained.measured
     strange = odd([title(e.key) for e in episodes], retained.states, np.array([e.course for e in episodes]))
     return RecordingFacts(
         identify_on=condition_of(population.select(part), options.identify_on),
         groups=groups,
         train=train,
         test=test,
-        resolution={m: _median([g.resolution[m] for g in read]) for m in retained.measured},
+        resolution={m: float(np.quantile([g.resolution[m] for g in read], 0.5, method="lower")) for m in measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
         alerts=(*_unlike(retained, read, groups), *strange),
         reserve=tuple(options.reserve),
@@ -258,11 +257,6 @@ def _read_group(task: _Group) -> _GroupFacts:
         record = write_group(population, task.folder, episodes_in_turn())
         written = file_digest(task.folder / record.file)
     return _GroupFacts(record, written, resolution, episodes, np.mean(covariances, axis=0))
-
-
-def _median(steps: list[float]) -> float:
-    """Return the median of the steps of all units, one of them where there are two."""
-    return float(np.quantile(steps, 0.5, method="lower"))
 
 
 def _resolution(population: Population, key: EpisodeKey, prepared: Array) -> dict[str, float]:

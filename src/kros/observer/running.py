@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -18,7 +18,7 @@ from .step import forward
 from .tracking import PhaseLockedLoop
 
 
-class Estimate(Mapping[str, float]):
+class Estimate(dict[str, float]):
     """Estimated states by name, those that recordings hold; ``np.asarray(estimate)`` has shape (n,).
 
     Examples
@@ -32,25 +32,11 @@ class Estimate(Mapping[str, float]):
     (0.25, [0.75, 0.25])
     """
 
-    __slots__ = ("_array", "_places")
-
-    def __init__(self, places: Mapping[str, int], array: Array) -> None:
-        self._places, self._array = places, array
-
-    def __getitem__(self, name: str) -> float:
-        return float(self._array[self._places[name]])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
-
-    def __len__(self) -> int:
-        return len(self._places)
-
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> AnyArray:
-        return np.array(self._array, dtype=dtype, copy=copy)
+        return np.array([*self.values()], dtype=dtype, copy=copy)
 
     def __repr__(self) -> str:
-        return f"Estimate({', '.join(f'{name}={self[name]:g}' for name in self)})"
+        return f"Estimate({', '.join(f'{name}={value:g}' for name, value in self.items())})"
 
 
 class RunningObserver:
@@ -78,7 +64,6 @@ class RunningObserver:
     def __init__(self, observer: ObserverData, y: ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
         self._screen, self._course = Screen.of(observer), Course(observer, 1, parameters)
-        self._places = {name: i for i, name in enumerate(observer.recorded)}
         self._watch = None if observer.monitor is None else Watch(observer.monitor)
         self.parameters = parameters
         self.reset(y)
@@ -121,10 +106,8 @@ class RunningObserver:
     def reset(self, y: ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         first = self._sample(y, np.zeros(len(self.observer.inputs)))
-        self._status, self._fresh = (
-            SampleStatus(int(first.status[0, 0])),
-            bool(self._screen.enough(np.isfinite(first.y)).all()),
-        )
+        self._status = SampleStatus(int(first.status[0, 0]))
+        self._fresh = bool(self._screen.enough(np.isfinite(first.y)).all())
         self._course.begin(first)
         if self._watch is not None:
             self._watch.reset()
@@ -209,4 +192,5 @@ class RunningObserver:
         ahead, steps = self._course.ahead(), self._course.steps
         if len(ahead):
             x = forward(self.observer, steps.values, np.array([len(ahead)]), x, steps.earlier(ahead[0]), ahead)
-        return Estimate(self._places, self.observer.runtime.clip_estimate(x[0, : len(self._places)].copy()))
+        recorded = self.observer.runtime.clip_estimate(x[0, : len(self.states)])
+        return Estimate(zip(self.states, recorded.tolist(), strict=True))

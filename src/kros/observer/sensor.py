@@ -37,7 +37,7 @@ class Sensor(Settings):
         0.0,
         description="size of a constant offset; nothing can correct it, but the estimator avoids what would feel it",
     )
-    delay_samples: int = Field(0, ge=0, description="samples by which measurements arrive late")
+    delay_samples: int = Field(0, ge=0, le=500, description="samples by which measurements arrive late")
     jitter_samples: float = Field(0.0, ge=0, description="standard deviation of the moment of measurement, in samples")
     dropout: float = Field(0.0, ge=0, lt=1, description="probability that a sample is lost, independently of others")
 

@@ -81,9 +81,8 @@ def recorded_channel(observer: ObserverData, name: str) -> RecordedChannel:
         )
     factor, converted = (_factor(observer, name, own.get(key, 1.0)) for key in ("factor", "converted"))
     lag, offset = own.get("lag_samples", 0), own.get("offset", "")
-    note = ", ".join(
-        [*([f"the column comes {lag} samples late"] if lag else []), *([f"added: {offset}"] if offset else [])]
-    )
+    late = f"the column comes {lag} samples late" if lag else ""
+    note = ", ".join(filter(None, (late, f"added: {offset}" if offset else "")))
     factor = factor if converted == 1.0 else factor / converted
     if math.isclose(factor, 1.0, rel_tol=ROUNDING):
         return RecordedChannel(1.0, unit, note)

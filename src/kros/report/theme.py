@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from enum import StrEnum
 from typing import Self
 
-from ..core import Record, frozen
+from ..core import frozen
 
 
 @frozen
@@ -73,47 +73,47 @@ class Tone(StrEnum):
         return f"--{self.name.lower()}"
 
 
-HUES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)
+HUES = [Tone[name] for name in ["BLUE", "ORANGE", "GREEN", "PURPLE", "GOLD", "SKY", "GREY", "INK"]]
 
-_SETTINGS: Record = {
-    "font.family": "DejaVu Sans",
-    "font.size": 8.5,
-    "axes.titlesize": "medium",
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlecolor": Tone.INK,
-    "axes.labelsize": "medium",
-    "axes.labelcolor": Tone.INK,
-    "axes.edgecolor": Tone.SOFT,
-    "axes.linewidth": DRAWING.thin,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.facecolor": "none",
-    "grid.color": Tone.GRID,
-    "grid.linewidth": DRAWING.thin,
-    "text.color": Tone.INK,
-    "xtick.color": Tone.SOFT,
-    "ytick.color": Tone.SOFT,
-    "xtick.labelcolor": Tone.INK,
-    "ytick.labelcolor": Tone.INK,
-    "xtick.labelsize": "small",
-    "ytick.labelsize": "small",
-    "xtick.major.width": DRAWING.thin,
-    "ytick.major.width": DRAWING.thin,
-    "lines.linewidth": 1.2,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "path.simplify_threshold": 0.3,
-    "text.hinting": "none",
-    "svg.fonttype": "none",
-    "svg.hashsalt": "kros",
-    "pdf.fonttype": 42,
-}
+_SHEET = f"""
+font.family: DejaVu Sans
+font.size: 8.5
+axes.titlesize: medium
+axes.titleweight: bold
+axes.titlelocation: left
+axes.titlecolor: {Tone.INK}
+axes.labelsize: medium
+axes.labelcolor: {Tone.INK}
+axes.edgecolor: {Tone.SOFT}
+axes.linewidth: {DRAWING.thin}
+axes.spines.top: False
+axes.spines.right: False
+axes.grid: True
+axes.facecolor: none
+grid.color: {Tone.GRID}
+grid.linewidth: {DRAWING.thin}
+text.color: {Tone.INK}
+xtick.color: {Tone.SOFT}
+ytick.color: {Tone.SOFT}
+xtick.labelcolor: {Tone.INK}
+ytick.labelcolor: {Tone.INK}
+xtick.labelsize: small
+ytick.labelsize: small
+xtick.major.width: {DRAWING.thin}
+ytick.major.width: {DRAWING.thin}
+lines.linewidth: 1.2
+legend.frameon: False
+legend.fontsize: 8
+path.simplify_threshold: 0.3
+text.hinting: none
+svg.fonttype: none
+svg.hashsalt: kros
+pdf.fonttype: 42
+"""
 
 
 def style() -> AbstractContextManager[None]:
     """Return a context in which new figures get this theme; settings of the caller come back afterwards."""
     import matplotlib
 
-    return matplotlib.rc_context(_SETTINGS)  # type: ignore[arg-type]
+    return matplotlib.rc_context(dict(row.split(": ") for row in _SHEET.split("\n") if row))  # type: ignore[arg-type]

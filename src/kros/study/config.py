@@ -80,13 +80,6 @@ class EvaluateConfig(Settings):
     )
     confidence: float = Field(0.95, gt=0, lt=1, description="of that bound")
 
-    @field_validator("folds")
-    @classmethod
-    def _several(cls, value: int) -> int:
-        if value == 1:
-            raise ValueError("folds should be 0 or at least 2: one fold would leave no unit to learn from")
-        return value
-
 
 class LoadConfig(Settings):
     """Load torque ``moment sin(position) + inertia position''``, over the torque constant, of a mounted mass."""

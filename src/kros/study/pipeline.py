@@ -25,6 +25,7 @@ from .engine.store import load_run as load_run  # where readers of runs look for
 from .metrics import collect_metrics
 from .stages import evaluate, learning, left_out, report
 from .stages.learning import LEARNING
+from .stages.load import require_load
 
 STEPS = (
     *LEARNING,
@@ -184,6 +185,8 @@ def require_usable(config: StudyConfig, until: Stage, population: Population | N
     lifting = resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
     resolve_phase(config.calibrate, population, lifting)
     require_measured(config.sensor, population.measured)
+    config.estimator.require_states(population.states)
+    require_load(config.load, population)
     if config.evaluate.folds:
         left_out.parted([u.id for u in population.units if u.group != OUTLIERS], config.evaluate.folds)
 

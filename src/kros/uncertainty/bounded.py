@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from ..core import ITERATED, AnyArray, ArrayLike, ConfigError, DataError, DimensionError, StateSpace, frozen
-from ..core.frequency import check_grid, log_grid
+from ..core.frequency import log_grid
 from ..core.linalg import sigma_max
 from ..identify.refine.metric import smallest_largest
-from .forms import Form, as_form, check_responses, misfit, residual
+from .forms import Form, as_form, check_grid, check_responses, misfit, residual
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .settings import SET, WeightSettings
 from .weights.fit import Residuals, Sampled, fit_weight

@@ -30,7 +30,7 @@ class UncertaintySettings(Settings):
     """Uncertainty model and outlier scores: the keys of a study."""
 
     form: FORMS = Field("inverse_input_multiplicative", description="of the uncertain set")
-    n_freqs: int = Field(1000, ge=50, description="points of the frequency grid")
+    n_freqs: int = Field(1000, ge=50, le=100_000, description="points of the frequency grid")
     outlier_form: FORMS = Field("additive", description="of the residuals that outlier scores are made of")
 
 

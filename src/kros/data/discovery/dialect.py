@@ -19,7 +19,7 @@ from ..readers.formats import is_binary, texts_of
 from ..readers.tables import ABSENT, ORDERS, Dialect, Table, cells_of, head_of, lines_of, microseconds
 from .examine import RULE
 
-MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
+MARKS = [tuple(marks) for marks in (";,", ";.", "\t,", "\t.", ",.", "|.", "|,", " .", " ,")]  # delimiter, decimal point
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
 _CLOCK = re.compile(r"^(?:\d+[-./]\d+[-./]\d+[T ]\s*)?\d{1,2}:\d{2}:\d{2}\b")
 _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
@@ -119,7 +119,7 @@ def _described(path: Path, rows: list[list[str]], dialect: Dialect) -> TableHead
     """Tell header, row of units and numbers apart."""
     data = [i for i, r in enumerate(rows) if _is_data(r, dialect.decimal)]
     width = _width([rows[i] for i in data])
-    first = next(i for i in data if len(rows[i]) == width and (i + 1 >= len(rows) or i + 1 in data))
+    first = next((i for i in data if len(rows[i]) == width and (i + 1 >= len(rows) or i + 1 in data)), data[0])
     cells = tuple(tuple(rows[i]) for i in data if i >= first)[: RULE.rows]
     written = sum(bool(c) for c in cells[0])
     above = [i for i in range(first) if 2 * sum(map(bool, rows[i])) >= written and abs(len(rows[i]) - width) <= 1]

@@ -129,7 +129,7 @@ def _columns(
     numeric = [c for c in columns if head.is_numeric(c.at)]
     table, samples = _sampled(source, tables, numeric)
     candidates, labels = time_columns(numeric, samples), dict[str, str]()
-    if not period_s and not candidates:
+    if period_s is None and not candidates:
         labels = label_columns(table)  # of several episodes in a file
     if labels:
         texts = [table.texts(table.fields.index(label)) for label in labels.values()]
@@ -137,7 +137,7 @@ def _columns(
         samples = {at: [signals[0][rows] for rows in episodes] for at, signals in samples.items()}
         candidates = time_columns(numeric, samples)
     known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), dict[str, str]()
-    if not period_s:
+    if period_s is None:
         time, keys, notes = _time(source, head, columns, candidates, samples)
         known[time.at] = replace(time, part=ColumnPart.TIME)
     keys |= {"labels": labels} if labels else {}
@@ -199,39 +199,41 @@ def _channel(column: TableColumn) -> Record:
 
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
     """Return the columns with measured states and inputs as named, where any are named, else as proposed."""
-    decided, measured, given = list(columns), ColumnPart.MEASURED, ColumnPart.INPUT
-    places = {
-        measured: [_place(columns, n) for n in wanted.measured],
-        given: [_place(columns, n) for n in wanted.inputs],
+    measured, given, decided = ColumnPart.MEASURED, ColumnPart.INPUT, list[TableColumn]()
+    freed = {measured: ColumnPart.STATE, given: ColumnPart.LEFT_OUT}
+    named = {
+        measured: [_named(columns, n) for n in wanted.measured],
+        given: [_named(columns, n) for n in wanted.inputs],
     }
-    if both := set(places[measured]) & set(places[given]):
-        name = columns[both.pop()].name
-        raise ConfigError(f"Roles: --measured and --input both name the column {name!r}; name it in one of them.")
-    for part, freed in ((measured, ColumnPart.STATE), (given, ColumnPart.LEFT_OUT)):
-        for i, column in enumerate(decided):
-            if i in places[part]:
-                decided[i] = replace(column, part=part, why="as named")
-            elif places[part] and column.part is part:
-                decided[i] = replace(column, part=freed)
+    for column in columns:
+        parts = [part for part, of in named.items() if column in of]
+        if len(parts) > 1:
+            problem = f"--measured and --input both name the column {column.name!r}"
+            raise ConfigError(f"Roles: {problem}; name it in one of them.")
+        part = freed[column.part] if named.get(column.part) else column.part
+        decided.append(replace(column, part=parts[0], why="as named") if parts else replace(column, part=part))
     for part, what, option in ((measured, "a measured state", "--measured"), (given, "an input", "--input")):
         if not any(c.part is part for c in decided):
-            free = [c for c in decided if c.part is not ColumnPart.TIME]
-            known = ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in free)
             problem = f"no column is {what} by its name; name it, {option} NAME"
+            known = _names([c for c in decided if c.part is not ColumnPart.TIME])
             raise ConfigError(f"Roles: {problem}. The columns are {known}.")
     if any(c.part is ColumnPart.STATE for c in decided):
         return decided
     return [replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided]  # to be estimated
 
 
-def _place(columns: Sequence[TableColumn], name: str) -> int:
-    """Return the position of a column by the name of its channel, else by its header."""
-    names = [c.name for c in columns]
-    for known in (names, [c.header for c in columns]):
-        if name in known:
-            return known.index(name)
-    hint = did_you_mean(name, names) or ";"
-    raise ConfigError(f"Roles: there is no column {name!r}{hint} The columns are {', '.join(names)}.")
+def _named(columns: Sequence[TableColumn], name: str) -> TableColumn:
+    """Return a column by the name of its channel, else by its header."""
+    free = [c for c in columns if c.part is not ColumnPart.TIME]
+    for column in (*(c for c in free if c.name == name), *(c for c in free if c.header == name)):
+        return column
+    hint = did_you_mean(name, [c.name for c in free]) or ";"
+    raise ConfigError(f"Roles: there is no column {name!r}{hint} beside time there are {_names(free)}.")
+
+
+def _names(columns: Sequence[TableColumn]) -> str:
+    """Return the names of channels, with their headers where these are others."""
+    return ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in columns)
 
 
 def _examined(source: Path, draft: Discovery, excluded: Sequence[str], fewest: int, work: Work | None) -> Discovery:

@@ -47,9 +47,7 @@ def infer_names(paths: Sequence[str]) -> tuple[str, str | None]:
     stems = [p[: len(p) - len(ending)] for p, ending in zip(paths, ends, strict=True)]
     endings = sorted({re.escape(p[len(stem) :]) for p, stem in zip(paths, stems, strict=True)})
     ending = endings[0] if len(endings) == 1 else f"(?:{'|'.join(endings)})"
-    for cut in (_words(stems), _aligned(stems)):
-        if cut is None:
-            continue
+    if cut := _cut(stems):
         columns = list(zip(*(p[::2] for p in cut), strict=True))
         roles, sure = _roles(columns, max((i for i, mark in enumerate(cut[0][1::2], 1) if "/" in mark), default=0))
         pattern = _pattern(cut, roles, ending)
@@ -70,18 +68,16 @@ def _counts(words: Sequence[str]) -> bool:
     return len(numbers) > 1 and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == len(numbers) - 1
 
 
-def _words(stems: Sequence[str]) -> Cut | None:
-    """Cut into words; a number with a decimal point, or a version, stays whole."""
-    for marks in (r"([/_\-. ]+)", r"([/_\- ]+)", r"([/_ ]+)"):
+def _cut(stems: Sequence[str]) -> Cut | None:
+    """Cut into words, where some paths have more into what all begin with and as many at the end as all have.
+
+    A number with a decimal point, or a version, stays whole.
+    """
+    whole = any(re.search(r"\w\.\d", s) for s in stems)
+    for marks in (r"([/_\-. ]+)", r"([/_\- ]+)", r"([/_ ]+)")[whole:]:
         parts = [re.split(marks, s) for s in stems]
-        if len(set(map(len, parts))) == 1 and not ("." in marks and any(re.search(r"\w\.\d", s) for s in stems)):
+        if len(set(map(len, parts))) == 1:
             return parts
-    return None
-
-
-def _aligned(stems: Sequence[str]) -> Cut | None:
-    """Cut into words where some paths have more: what all begin with, and as many words at the end as all have."""
-    parts = [re.split(r"([/_ ]+)", s) for s in stems]
     fewest, head = min(map(len, parts)), 0
     while head + 1 < fewest and len({tuple(p[head : head + 2]) for p in parts}) == 1:
         head += 2
@@ -138,8 +134,8 @@ def _by_place(columns: list[Names], folders: int, varying: Sequence[int], left: 
         repeated = [i for i in left if alone or len(set(columns[i])) < len(columns[i])]
         counted = [i for i in repeated if i in numbered]
         above = [i for i in counted if i < folders and EPISODE in roles[i:]]  # hall1/crane1/run1: a folder of runs
-        spelled = [i for i in counted if not all(map(str.isdecimal, columns[i]))]
-        named = [i for i in spelled if EPISODE in roles or i < left[-1]]  # heavy_KX1041_1
+        inner = [i for i in counted if EPISODE in roles or i < left[-1]]
+        named = [i for i in inner if not all(map(str.isdecimal, columns[i]))]  # heavy_KX1041_1
         labelled = [j for i in set(repeated) - set(counted) for j in counted if _share(columns[i], columns[j]) == GROUP]
         for i in (above[-1:] or named or labelled or repeated)[:1]:
             roles[i] = UNIT

@@ -10,11 +10,12 @@ import numpy as np
 
 from ...core import Array, frozen
 from ..measures import ZERO_OF_CELSIUS, Measure, clean_unit, identifier, kind_of, measure, split_header, words_of
+from ..readers.parquet import KEYS
 from ..readers.tables import Table, stretches
 
 UNKNOWN = "not recognised"
 Samples = Mapping[int, Sequence[Array]]  # of columns by their place, from several episodes
-_STATES = ("angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration")
+_STATES = ["angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration"]
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
 
 LABELS = {
@@ -66,7 +67,7 @@ def describe(table: Table) -> list[TableColumn]:
         stem, written = split_header(header)
         unit = clean_unit(stated) or clean_unit(written)
         name = header if header.isidentifier() and not written else stem
-        name = identifier(f"column_{name}" if name.isdigit() else name, [c.name for c in columns])
+        name = identifier(f"column_{name}" if name.isdigit() else name, [*KEYS, "k", *(c.name for c in columns)])
         known = measure(unit) or Measure(unit, 1.0, 0.0)
         if known.offset:  # a temperature whose zero is not that of K
             known = Measure("degC", known.factor, known.offset - ZERO_OF_CELSIUS)

@@ -71,7 +71,7 @@ class CsvMapping(Dialect):
     timestamp: Literal["ymd", "dmy", "mdy"] | None = Field(
         None, description="where time is a timestamp: the order of its date; a time of day alone takes any of them"
     )
-    pieces: int = Field(1, ge=1, le=100_000, description="equal episodes that a file is cut into, `<episode>.1` ...")
+    pieces: int = Field(1, ge=1, le=1000, description="equal episodes that a file is cut into, `<episode>.1` ...")
     labels: dict[Literal["unit", "condition", "episode"], Column] = Field(
         {}, description='columns that state what a row belongs to, for example `{unit = "serial"}`'
     )
@@ -88,7 +88,7 @@ class CsvMapping(Dialect):
         try:
             unknown = sorted(set(re.compile(value or "").groupindex) - set(GROUPS))
         except (re.error, RecursionError, OverflowError) as error:
-            raise ValueError(f"{value!r} is not a regular expression ({error})") from error
+            raise ValueError(f"input is not a regular expression ({error})") from error
         if unknown:
             raise ValueError(f"names the group {unknown[0]!r}; known groups are {', '.join(GROUPS)}")
         return value
@@ -99,7 +99,7 @@ class CsvMapping(Dialect):
         try:
             codecs.lookup(value)
         except LookupError as error:
-            raise ValueError(f"encoding {value!r} is unknown; known are utf-8, latin-1, cp1252, utf-16 ...") from error
+            raise ValueError("input should be an encoding, such as utf-8, latin-1, cp1252 or utf-16") from error
         return value
 
     @model_validator(mode="after")
@@ -117,6 +117,9 @@ class CsvMapping(Dialect):
         if not names:
             raise ValueError("there is no [[channel]]; declare each channel with name, column and role")
         for unit in self.units:
+            places = [self.column(c, unit) for c in self.channel if c.role is not Role.TRUTH]
+            if len(set(places)) < len(places):
+                raise ValueError(f"every channel needs a column of its own, found {places}; correct the columns")
             if unknown := sorted(set(unit.columns) - set(names)):
                 gives = f"[[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}"
                 raise ValueError(f"{gives}; the channels are {names}")
@@ -194,7 +197,7 @@ def mapping_schema() -> Record:
 
 
 log = logging.getLogger(__name__)
-ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", *FORMATS)
+ENDINGS = (*[".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz"], *FORMATS)
 _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
 
 

@@ -23,7 +23,7 @@ from ..measures import clean_unit, is_unit_row, split_header
 from .formats import columns_of, is_binary, texts_of, values_of
 
 # cells of spreadsheets without a number
-ABSENT = ("-", "--", "---", *["#DIV/0!", "#NUM!", "#REF!", "#VALUE!", "#WERT!", "#ZAHL!", "#BEZUG!", "#NV"])
+ABSENT = ["-", "--", "---", "#DIV/0!", "#NUM!", "#REF!", "#VALUE!", "#WERT!", "#ZAHL!", "#BEZUG!", "#NV"]
 BLOCK = 4 << 20  # bytes that Arrow parses at once; a line has to fit into two
 HEAD = 1 << 18  # bytes of a file that say how it is written, and what its columns are called
 TIMESTAMP_SCALE = 1e-6  # timestamps are read in microseconds, which doubles hold exactly
@@ -162,7 +162,7 @@ def lines_of(content: bytes, encoding: str, path: Path) -> list[str]:
     """Return the first lines of a file; the last character may be cut."""
     try:
         text = codecs.getincrementaldecoder(encoding)().decode(content)
-    except UnicodeDecodeError as error:
+    except UnicodeError as error:
         problem = f"its first lines are not {encoding.upper()} ({error})"
         raise DataError(f"Reading {path}: {problem}; name the encoding, such as cp1252 or UTF-16.") from error
     return re.split("\r\n|\r|\n", re.sub("(\r\n|\r|\n)\\Z", "", text.removeprefix("\ufeff")))

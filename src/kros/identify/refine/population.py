@@ -67,12 +67,12 @@ def refine_population(
     Examples
     --------
     >>> import kros
-    >>> from kros.identify import combine, episode_factors
+    >>> from kros.identify import unit_factors
     >>> from kros.identify.refine import GaussNewton, RefineOptions, refine_population
     >>> from kros.lifting import Lifting
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
     >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
-    >>> factor = combine(episode_factors(motors, keys, Lifting(motors.states)))
+    >>> factor = unit_factors(motors, keys, Lifting(motors.states))
     >>> options = RefineOptions(horizons=(20,), segments=4, search=GaussNewton(iterations=3), path_iterations=3)
     >>> models = refine_population(motors, keys, Lifting(motors.states), {}, factor, options=options)
     >>> models.A.shape, bool(models.spectral_radius().max() < 1)

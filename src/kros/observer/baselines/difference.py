@@ -75,8 +75,6 @@ def cutoffs_hz(sample_period_s: float) -> Array:
 def hold_missing(y: Array) -> Array:
     """Return measurements, (n_samples, ...), with the last that arrived for those that are missing, zero before it."""
     there = np.isfinite(y)
-    if there.all():
-        return y
     shape = (-1, *[1] * (y.ndim - 1))
     last = np.maximum.accumulate(np.where(there, np.arange(len(y)).reshape(shape), 0), axis=0)
     return np.take_along_axis(np.where(there, y, 0.0), last, axis=0)

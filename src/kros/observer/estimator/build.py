@@ -144,10 +144,8 @@ def bounded(observer: Observer, recordings: Recordings, settings: EstimatorSetti
     lower, upper = (np.full(observer.lifting.n_states, end) for end in (-np.inf, np.inf))
     hidden = [i for i in range(len(recordings.size)) if i not in observer.measured]
     lower[hidden], upper[hidden] = (low - room * (high - low))[hidden], (high + room * (high - low))[hidden]
+    settings.require_states(observer.recorded)
     for name, ends in settings.limits.items():
-        if name not in observer.recorded:
-            known = ", ".join(observer.recorded)
-            raise ConfigError(f"Estimator: limits should be of the states {known}, found {name!r}; correct the name.")
         i, size = states.index(name), observer.lifting.sizes_of([name])[0]
         lower[i], upper[i] = max(lower[i], ends[0] / size), min(upper[i], ends[1] / size)
     return Runtime(0, lower, upper)

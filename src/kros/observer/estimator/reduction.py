@@ -96,7 +96,7 @@ def reduced(readout: Readout, order: int | None = None, coefficients: Array | No
     kept = values > EPS * values[0]
     L, inverse = values[kept, None] * U[kept], U[kept].T / values[kept]
     _, sigma, V = np.linalg.svd(qr_triangle((X / size * np.sqrt(w)[:, None]) @ L.T))
-    scale = np.maximum(sigma, EPS * sigma[0])  # states of RMS one
+    scale = np.maximum(sigma, EPS * sigma[:1])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
     whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
     if order is not None:

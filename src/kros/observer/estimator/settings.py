@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydantic import Field
 
-from ...core import ITERATED, Settings
+from ...core import ITERATED, ConfigError, Settings
 
 
 class EstimatorSettings(Settings):
@@ -114,6 +116,13 @@ class EstimatorSettings(Settings):
         12, ge=1, description="patterns of losses that are simulated on them, at least; more on short episodes"
     )
     seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")
+
+    def require_states(self, states: Sequence[str]) -> None:
+        """Refuse limits of what is no state, or in the wrong order."""
+        for name, (least, most) in self.limits.items():
+            if name not in states or least > most:
+                wanted = f"should be the least and the largest value of one of {', '.join(states)}"
+                raise ConfigError(f"estimator.limits: {name} = [{least:g}, {most:g}] {wanted}; correct it.")
 
     def lags(self, length: float) -> tuple[float, ...]:
         """Return the time constants of the lags in samples, for a median episode of this length in samples."""

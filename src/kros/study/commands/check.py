@@ -14,8 +14,8 @@ from ...data import Population
 from ...data.recording import check_population
 from ...identify import ModelSet
 from ...identify.calibration import Values, training_keys, unit_parameters
+from ...identify.factors import reduce_episodes
 from ...identify.identified import EpisodeFactors
-from ...identify.identify import reduce_episodes
 from ...observer import run_innovations, screened
 from ...report.unit_verdicts import Rows, with_verdict
 from ...uncertainty import OutlierModel
@@ -47,8 +47,7 @@ def verdicts(context: Context, data: Path, workers: int = 1, same_unit: bool = F
 def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     """Score the units of some recordings."""
     store = context.store
-    matches = (re.fullmatch("outliers/([^/]+)/outlier_model.json", name) for name in sorted(store.files()))
-    names = [match[1] for match in matches if match]
+    names = re.findall("^outliers/([^/]+)/outlier_model.json$", "\n".join(sorted(store.files())), re.MULTILINE)
     observer = context.deployed if store.holds(*DEPLOYED) else None
     population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import field, replace
@@ -28,6 +27,7 @@ from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
 from ...identify.calibration import Texts, Values, unit_values
 from ...observer import Observer, SampleStatus
+from ...observer.sensor import delay_of
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import Stage, StudyConfig, validate_config
@@ -193,26 +193,23 @@ class FieldRecordings:
         return arriving(self.observer, self.population, {key: self.population.read(key)}, self.values)
 
     def estimates(self) -> Iterator[Estimated]:
-        """Run the observer over all episodes, block by block."""
+        """Run the observer over all episodes, every block behind the samples that late measurements are read from."""
+        observer, n = self.observer, len(self.observer.recorded)
+        late = delay_of(observer.sensor)
         for key in self.population.episodes:
-            yield from self._run(key)
-
-    def _run(self, key: EpisodeKey) -> Iterator[Estimated]:
-        """Run over an episode, every block behind the samples that late measurements are read from."""
-        observer, n, start, course = self.observer, len(self.observer.recorded), 0, None
-        loop = None if self.name is None else PhaseLockedLoop(observer, self.name, 1)
-        late = math.ceil(max((s.delay_samples for s in observer.sensor.values()), default=0))
-        before = np.empty((0, len(self.population.channels)))
-        for block in self.population.blocks(key, _BLOCK):
-            values, lead = np.concatenate([before, block]), len(before)
-            arrived = arriving(observer, self.population, {key: values}, self.values)
-            course = course or Course(observer, 1, arrived.parameters, loop)
-            run = course.take(arrived.y[lead:], arrived.u[lead:])
-            columns = run.estimates[:, 0, :n]
-            if loop is not None:
-                columns = np.column_stack([columns, np.broadcast_to(run.followed, run.status.shape)[:, 0]])
-            yield key, start, columns, run.status[:, 0], block
-            start, before = start + len(block), values[max(0, len(values) - late) :]
+            start, course = 0, None
+            loop = None if self.name is None else PhaseLockedLoop(observer, self.name, 1)
+            before = np.empty((0, len(self.population.channels)))
+            for block in self.population.blocks(key, _BLOCK):
+                values, lead = np.concatenate([before, block]), len(before)
+                arrived = arriving(observer, self.population, {key: values}, self.values)
+                course = course or Course(observer, 1, arrived.parameters, loop)
+                run = course.take(arrived.y[lead:], arrived.u[lead:])
+                columns = run.estimates[:, 0, :n]
+                if loop is not None:
+                    columns = np.column_stack([columns, np.broadcast_to(run.followed, run.status.shape)[:, 0]])
+                yield key, start, columns, run.status[:, 0], block
+                start, before = start + len(block), values[max(0, len(values) - late) :]
 
 
 def status_counts(status: Bits) -> Counter[str]:

@@ -45,16 +45,11 @@ def _line(key: str, value: Any, note: str) -> str:
 
 
 def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        literal = "\\" in value and "'" not in value and value.isprintable()
-        return f"'{value}'" if literal else json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_value(v) for v in value)}]"
     if isinstance(value, dict):
         return f"{{ {', '.join(key_lines(value))} }}"
-    return repr(value)
+    if isinstance(value, str) and "\\" in value and "'" not in value and value.isprintable():
+        return f"'{value}'"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML writes the rest as JSON does
 
 
 def _one_line(text: str) -> str:

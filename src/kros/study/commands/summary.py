@@ -19,7 +19,7 @@ from ..engine.context import open_finished
 from ..engine.store import METRICS
 from ..pipeline import RunResult
 
-_REQUIRED = ("numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "jinja2", "matplotlib")
+_REQUIRED = ["numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "jinja2", "matplotlib"]
 _OPTIONAL = {
     "distributed": "maps over units on a cluster (kros run --scheduler)",
     "pandas": "reading long data frames",

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from ...core import Array, ConfigError, KrosError, Record, frozen, load_artifact, save_artifact
-from ...data import EpisodeBatch
+from ...data import EpisodeBatch, Population, some
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
@@ -23,6 +23,7 @@ from ...motor_drive import AngleLoad
 from ...motor_drive.observer import LoadSettings, load_observer
 from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
 from ...observer import EstimatorSettings, Observer, run_observer
+from ..config import LoadConfig
 from ..engine.context import Context
 
 log = logging.getLogger(__name__)
@@ -44,6 +45,15 @@ class TrialSettings:
 
 
 TRIAL = TrialSettings()
+
+
+def require_load(config: LoadConfig, population: Population) -> None:
+    """Refuse a declared load of units that were not recorded, or without the states that show it."""
+    known = {*population.unit_ids, *population.states}
+    missing = [name for name in (*config.units, TRIAL.angle, TRIAL.current) if name not in known]
+    if config.moment is not None and missing:
+        there = f"there is no unit or state {missing[0]!r} in {some(population.unit_ids)} or {some(population.states)}"
+        raise ConfigError(f"load: {there}; correct the name.")
 
 
 def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
@@ -137,9 +147,6 @@ class LoadTrial:
     def of(cls, context: Context) -> LoadTrial:
         """Read the recordings; refuse a study without a known load, or without other units to judge on."""
         facts, population, units = context.facts, context.population, context.identified.parameters
-        if missing := [name for name in (TRIAL.angle, TRIAL.current) if name not in population.states]:
-            states = ", ".join(population.states)
-            raise ConfigError(f"Load: there is no state {missing[0]!r} in {states}; give the channel this name.")
         usable = [u for u in facts.pooled if u in units]
         known, others = _known(context, usable)
         free, loaded = facts.identify_on, TRIAL.condition

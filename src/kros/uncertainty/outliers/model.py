@@ -27,8 +27,7 @@ from functools import cached_property
 import numpy as np
 
 from ...core import AnyArray, ArrayLike, ConfigError, DataError, Storable, frozen
-from ...core.frequency import check_grid
-from ..forms import Form, as_form, check_responses, evenly
+from ..forms import Form, as_form, check_grid, check_responses, evenly
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
 from .score import Comparison, OutlierScore, Status
@@ -92,17 +91,14 @@ class OutlierModel(Storable):
             raise DataError(f"Scoring unit {unit}: {len(rows)} others are left, two are needed; record more units.")
         G = check_responses([*self.responses[:1], response], ("those scored", unit), self.freqs_hz)[1]
         comparison = self._comparison(rows, G / self.output_scale[:, None] * self.input_scale)
-        both = margins(comparison.distances.levels, comparison.inliers, self.false_alarm_rate)
-        value, beyond = (float(of[-1]) for of in both)
-        margin = beyond if self.n_units >= OUTLIER.fewest else -np.inf
-        (score,) = comparison.scores((unit,), self.threshold_db, {len(rows): margin})
-        fewest = comparison.fewest_units(score, value - beyond, self.false_alarm_rate)
-        score = replace(score, fewest_units=fewest)
+        beyond = float(margins(comparison.distances.levels, comparison.inliers, comparison.rate)[1][-1])
+        (score,) = comparison.scores((unit,), self.threshold_db, {len(rows): beyond})
         level = comparison.distances.levels[-1]
         motion = 0.0 if motion_db is None else 10 ** (motion_db / 20)
-        beyond = np.maximum(10 ** (level / 20) - motion, OUTLIER.least)
-        certain = margin - float(level.max() - 20 * np.log10(beyond.max()))
-        return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
+        rest = np.maximum(10 ** (level / 20) - motion, OUTLIER.least)
+        certain = beyond - float(level.max() - 20 * np.log10(rest.max()))
+        other = score.outlier and certain <= 0
+        return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if other else score
 
     def _comparison(self, rows: AnyArray, response: AnyArray) -> Comparison:
         """Return some inliers and one more unit, which comes last."""
@@ -111,7 +107,7 @@ class OutlierModel(Storable):
         levels = scaled_levels(self.form, responses[known.nominals], response, known, self.freqs_hz)
         inliers = np.arange(len(rows) + 1) < len(rows)
         everyone = np.concatenate([responses, response[None]])
-        return Comparison(self.form, everyone, self.freqs_hz, known.joined(levels), inliers)
+        return Comparison(self.form, everyone, self.freqs_hz, known.joined(levels), inliers, self.false_alarm_rate)
 
     def motion_levels(self, one: AnyArray, other: AnyArray) -> AnyArray:
         """Return the level, shape (frequency,), dB, by which estimates differ where motions do.
@@ -127,11 +123,6 @@ class OutlierModel(Storable):
     def extrapolated(self) -> bool:
         """Whether the rate is below 1 / (N + 1), so that it rests on the tail model alone."""
         return self.false_alarm_rate < 1 / (len(self.unit_ids) + 1)
-
-    @property
-    def n_units(self) -> int:
-        """Units that were compared, outliers among them; fewer than eight decide nothing."""
-        return sum(score.status is not Status.NOT_ENOUGH_DATA for score in self.scores)
 
     @cached_property
     def _known(self) -> Distances:
@@ -200,7 +191,7 @@ def score_outliers(
     G = G / scales[0][:, None] * scales[1]
     found = distances(form, G, freqs)
     parts = separate(found.levels, rate)
-    comparison = Comparison(form, G, freqs, found, parts.inliers)
+    comparison = Comparison(form, G, freqs, found, parts.inliers, rate)
     inliers = np.flatnonzero(parts.inliers)
     scores = comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist())))
     names = tuple(ids[k] for k in inliers)

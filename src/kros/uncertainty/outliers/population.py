@@ -77,7 +77,7 @@ def score_condition(
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
     """Return a score as a row of metrics, with what was recorded and what is needed."""
-    same = ("outlier", "freq_hz", "excess_db", "lowest_db", "highest_db", "status", "detectable_hz", "fewest_units")
+    same = ["outlier", "freq_hz", "excess_db", "lowest_db", "highest_db", "status", "detectable_hz", "fewest_units"]
     row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db}
     row |= {key: getattr(score, key) for key in same} | {"detectable": score.detectable_percent}
     return row | {"episodes": episodes, "recorded_s": recorded_s, "needed_s": recorded_s * score.more_data}

@@ -6,7 +6,7 @@ nothing is said about the unit instead of "ok".
 
 from __future__ import annotations
 
-import math
+from bisect import bisect_left
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
@@ -76,42 +76,39 @@ class Comparison:
     freqs_hz: AnyArray
     distances: Distances
     inliers: Flags
+    rate: float  # of false alarms
 
     def scores(self, ids: tuple[str, ...], threshold: float, margin_db: dict[int, float]) -> tuple[OutlierScore, ...]:
         """Return scores of the units with margins, whose names are given."""
         levels, units = self.distances.levels, np.array(list(margin_db))
         excess, by_nominal = (excesses(v, self.inliers) for v in (levels.max(axis=1), self.distances.peaks))
         lowest, highest = np.nanmin(by_nominal, axis=0), np.nanmax(by_nominal, axis=0)
-        freqs, scores = self.freqs_hz[levels.argmax(axis=1)], []
+        freqs, scores, known = self.freqs_hz[levels.argmax(axis=1)], [], bool(np.isfinite(threshold))
         for unit, name in zip(units, ids, strict=True):
             value, margin = float(excess[unit]), margin_db[int(unit)]
-            known = bool(np.isfinite(threshold) and np.isfinite(margin))
             levels_db = value, float(lowest[unit]), float(highest[unit])
             score_db = threshold + margin if known else value
             score = OutlierScore(name, score_db, threshold, known and margin > 0, float(freqs[unit]), *levels_db)
-            scores.append(self._detectable(score, int(unit), value - margin) if known else score)
+            scores.append(self._detectable(score, int(unit), value - margin))
         return tuple(scores)
 
     def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:
         """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
-        percent = self._percent(score, unit, bound_db)
+        cover = float(self.distances.levels[unit].max()) - score.excess_db
+        percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
+        percent = percent.min(axis=(0, 1))
         smallest, hz = float(percent.min()), float(self.freqs_hz[percent.argmin()])
-        shows = bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent
-        inlier = Status.OK if shows else Status.CANNOT_TELL
+        largest = min(OUTLIER.largest_db, bound_db + 20 * np.log10(OUTLIER.largest_percent / smallest))
+        share = factor(int(self.inliers.sum() - self.inliers[unit]), self.rate) * largest / bound_db
+        enough = OUTLIER.fewest + bisect_left(
+            range(OUTLIER.fewest, int(1 / self.rate)), True, key=lambda n: factor(n, self.rate) <= share
+        )
+        score = replace(score, fewest_units=enough if share >= 0 else None)
+        if not np.isfinite(score.threshold_db):
+            return score
+        inlier = Status.OK if bound_db <= largest else Status.CANNOT_TELL
         status = Status.OUTLIER if score.outlier else inlier
         return replace(score, status=status, detectable_percent=smallest, detectable_hz=hz)
-
-    def _percent(self, score: OutlierScore, unit: int, bound_db: float) -> AnyArray:
-        """Return the change of gain, at each frequency, that is an excess of the bound."""
-        cover = float(self.distances.levels[unit].max()) - score.excess_db
-        return OUTLIER.percent * 10 ** ((cover + bound_db - self._changes.max(axis=(0, 1))) / 20)
-
-    def fewest_units(self, score: OutlierScore, bound_db: float, rate: float) -> int | None:
-        """Return how many inliers would decide on the last unit, which has a bound by these, or None."""
-        smallest = self._percent(score, -1, bound_db).min()
-        largest = min(OUTLIER.largest_db, bound_db + 20 * np.log10(OUTLIER.largest_percent / smallest))
-        share = factor(int(self.inliers.sum()), rate) * largest / bound_db
-        return next((n for n in range(OUTLIER.fewest, math.ceil(1 / rate)) if factor(n, rate) <= share), None)
 
     @cached_property
     def _changes(self) -> AnyArray:

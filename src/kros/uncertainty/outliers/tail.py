@@ -70,7 +70,7 @@ class Separation(NamedTuple):
     """Inliers and outliers."""
 
     inliers: Flags  # (unit,)
-    margin_db: AnyArray  # (unit,), dB: beyond the bound when the unit went out, or at last; minus infinity unknown
+    margin_db: AnyArray  # (unit,), dB: beyond the bound when the unit went out, or at last
     threshold_db: float  # dB: what the largest excess of the inliers would have to exceed
 
 
@@ -79,7 +79,7 @@ def separate(levels: AnyArray, rate: float) -> Separation:
     n = len(levels)
     inliers, margin = np.ones(n, bool), np.full(n, -np.inf)
     if n < OUTLIER.fewest:
-        return Separation(inliers, margin, np.inf)
+        return Separation(inliers, margins(levels, inliers, rate)[1], np.inf)
     each = rate / (1 + n * rate)  # in expectation all steps together flag n * rate
     while True:
         value, beyond = margins(levels, inliers, each)

@@ -48,7 +48,7 @@ from ...core import (
     frozen,
     gain,
 )
-from ...core.frequency import check_grid
+from ..forms import check_grid
 from ..settings import MAGNITUDE, WEIGHT
 from .sections import Sections, bilinear_squared
 

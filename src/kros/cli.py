@@ -1,8 +1,7 @@
 """The command line: a thin face of `kros.study`.
 
 Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not
-met; 4 `kros check` cannot decide on a unit; 128 and the number of a signal that stopped it. `edge` makes one message of
-each exception, with the way to the traceback of a defect.
+met; 4 `kros check` cannot decide on a unit; 128 and the number of a signal that stopped it. See `edge`.
 """
 
 from __future__ import annotations
@@ -172,6 +171,7 @@ Quiet = Annotated[bool, _option("Print JSON and nothing else on standard output.
 Workers = Annotated[int | None, _option("Processes for maps over units; default: one a core.")]
 Overrides = Annotated[Names, _option("Override a key of the study.", "--set", metavar="KEY=VALUE")]
 Seed = Annotated[int, typer.Option(min=0)]
+Seconds = Annotated[float, typer.Option(min=5)]
 Prefix = Annotated[str | None, _option("Prefix of all names, a C identifier; default: that of the study.", "--name")]
 Precision = Annotated[str, _option("double or float")]
 ObserverName = Annotated[str, _option("Observer of the run; default: the one that is deployed.", "--observer")]
@@ -240,7 +240,7 @@ def demo(
     out: Annotated[Path, _option("Run folder: new, empty, or that of an earlier demo.")] = Path("runs/demo"),
     units: Annotated[int, typer.Option(min=2)] = 12,
     episodes: Annotated[int, typer.Option(min=2, max=1000)] = 10,
-    seconds: Annotated[float, typer.Option(min=5)] = 20.0,
+    seconds: Seconds = 20.0,
     seed: Seed = 0,
     set_: Overrides = None,
     workers: Workers = None,
@@ -259,7 +259,7 @@ def simulate(
     plant: Annotated[str, _option("harmonic-drive, pendulum or dc-motor.")] = "harmonic-drive",
     units: Annotated[int, typer.Option(min=1)] = 12,
     episodes: Annotated[int, typer.Option(min=1, max=1000)] = 10,
-    seconds: Annotated[float, typer.Option(min=5)] = 20.0,
+    seconds: Seconds = 20.0,
     seed: Seed = 0,
     outlier: Annotated[bool, _option("Add one badly assembled unit.", "--outlier")] = False,
     format_: Annotated[str, _option("parquet or raw, the paper's layout.", "--format")] = "parquet",

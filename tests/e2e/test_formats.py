@@ -35,7 +35,6 @@ def matlab(path: Path, time: Array, signals: dict[str, Array]) -> None:
     from scipy.io import savemat
 
     named = {f"{name}_{RECORDED[name][0]}": values for name, values in signals.items()}
-    named["voltage"] = named.pop("voltage_V")  # one letter is no unit of measure
     savemat(path, {"data": {"time": time, **named}, "note": "bench 4", "fs": 500.0})
 
 

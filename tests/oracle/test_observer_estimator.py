@@ -318,9 +318,12 @@ def test_estimates_stay_inside_declared_limits():
     )
     np.testing.assert_array_equal(limited[..., 2], np.clip(free[..., 2], -top, top))
     np.testing.assert_array_equal(limited[..., :2], free[..., :2])
-    wrong = FEW.model_copy(update={"limits": {"torque": (0.0, 1.0)}})
-    with pytest.raises(ConfigError, match="limits should be of the states position, velocity, current"):
-        identify_estimator("motor", *parts, settings=wrong)
+    for limits in ({"torque": (0.0, 1.0)}, {"current": (1.0, 0.0)}):
+        wrong = FEW.model_copy(update={"limits": limits})
+        with pytest.raises(
+            ConfigError, match="should be the least and the largest value of one of position, velocity,"
+        ):
+            identify_estimator("motor", *parts, settings=wrong)
 
 
 def test_families_grow_and_a_measurement_that_never_arrives_is_refused():

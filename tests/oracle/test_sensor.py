@@ -108,7 +108,8 @@ def test_recordings_arrive_late_at_an_observer_that_was_told_so_and_nothing_is_a
     [
         ({"velocity": {"noise": 1e-3}}, "velocity should be among the states that are measured"),
         ({"position": {"noise": -1.0}}, "sensor.position.noise"),
-        ({"position": {"noise": float("inf")}}, "finite"),
+        ({"position": {"noise": float("inf")}}, r"noise: input should be at most 1e\+50 in size, found inf"),
+        ({"position": {"delay_samples": True}}, "delay_samples: input should not be true or false, found True"),
         ({"position": {"dropout": 1.0}}, "less than 1"),
         (
             {"position": {"nois": 1.0}},

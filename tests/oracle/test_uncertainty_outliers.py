@@ -103,6 +103,22 @@ def test_fewer_than_eight_units_decide_nothing(count: int) -> None:
     assert [s.outlier for s in more.scores][:2] == [True, False]
 
 
+@pytest.mark.parametrize("spread", [1, 4, 8, 20])
+def test_the_fewest_units_that_would_decide_are_those_from_which_on_units_are_decided(spread: int) -> None:
+    """A unit like the others is decided on where its study has as many, and never where no number would."""
+    rng, found = np.random.default_rng(spread), []
+    for count in (FEWEST_UNITS - 1, FEWEST_UNITS, 12, 20) * 5:
+        model = score_outliers(resonant(spread * rng.normal(size=(5, count))), np.geomspace(0.01, 50, 60))
+        score = model.score("new", resonant(spread * rng.normal(size=(5, 1)))[0])
+        if score.status is not Status.OUTLIER:
+            enough = score.fewest_units is not None and score.fewest_units <= len(model.unit_ids)
+            assert (score.status is Status.OK) == enough
+            found.append(score.fewest_units)
+    assert all(n is None or n >= FEWEST_UNITS for n in found)
+    assert spread > 1 or set(found) == {FEWEST_UNITS}
+    assert spread < 20 or None in found
+
+
 def population(scales: list[float], seed: int = 0) -> np.ndarray:
     """Static plants around one, with the deviation of each in units of the common spread."""
     rng = np.random.default_rng(seed)

@@ -161,7 +161,7 @@ def test_another_rate(folder: Path) -> None:
             r"role: input should be 'state', 'input' or 'truth', found 'output'",
         ),
         ({"channel": []}, r"there is no \[\[channel\]\]"),
-        ({"files": "("}, r"files: .*'\(' is not a regular expression"),
+        ({"files": "("}, r"files: input is not a regular expression .*, found '\('"),
         ({"files": "(?P<run>a)"}, "names the group 'run'; known groups are unit, condition, episode, group"),
         ({"time": None}, "one of time and sample_period_s"),
         ({"sample_period_s": 0.1}, "one of time and sample_period_s"),

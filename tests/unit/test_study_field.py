@@ -58,6 +58,7 @@ def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_t
         "detectable": 5.0,
         "detectable_hz": 3.0,
         "units": 12,
+        "fewest_units": 14,
         "left_out": [],
         "outlier": False,
     }

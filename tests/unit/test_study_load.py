@@ -14,7 +14,7 @@ from kros.plants import HarmonicDrivePopulation
 from kros.report.figures.load import load_torque
 from kros.study.config import LoadConfig
 from kros.study.engine.store import Store
-from kros.study.stages.load import load_metrics, run_load
+from kros.study.stages.load import load_metrics, require_load, run_load
 
 POPULATION = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=3.0, seed=0, loop="soft").simulate().population
 
@@ -73,7 +73,8 @@ def test_without_a_moment_nothing_is_done(tmp_path: Path) -> None:
 def test_a_study_says_what_its_load_lacks(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="condition 'load'; known 001001, 001002, others none"):
         run_load(context(tmp_path, moment=0.2), {})
-    study = context(tmp_path, moment=0.2, units=("001001",))
-    study.population = SimpleNamespace(states=("position", "torque"))
-    with pytest.raises(ConfigError, match="no state 'current'"):
-        run_load(study, {})
+    load, known = LoadConfig(moment=0.2, units=("001001",)), {"unit_ids": ("001001",), "states": ("position", "torque")}
+    with pytest.raises(ConfigError, match="no unit or state 'current' in 001001 or position, torque"):
+        require_load(load, SimpleNamespace(**known))
+    with pytest.raises(ConfigError, match="no unit or state '001001'"):
+        require_load(load, SimpleNamespace(**known | {"unit_ids": ("7",)}))

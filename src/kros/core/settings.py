@@ -49,7 +49,7 @@ class Settings(BaseModel):
     @classmethod
     def _explain(cls, error: Any) -> str:
         key, value = ".".join(p for p in error["loc"] if isinstance(p, str)), error.get("input")
-        unknown, text = error["type"] == "extra_forbidden", str(error["msg"]).removeprefix("Value error, ")
+        unknown, text = error["type"] == "extra_forbidden", error["msg"].removeprefix("Value error, ")
         if reason := instead_of(key if unknown else f"{key}={value}"):
             return reason
         if unknown:

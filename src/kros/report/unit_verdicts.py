@@ -129,10 +129,9 @@ def _reasons(row: Record) -> list[str]:
     if "missing" in row:
         reasons.append(f"no score without {', '.join(row['missing'])}")
     elif row["status"] == Status.CANNOT_TELL:
-        fewest = row.get("fewest_units")
-        needs = f"needs about {fewest} units that differ as those of the study do, has {row['units']}"
+        needs = f"needs about {row['fewest_units']} units that differ as those of the study do, has {row['units']}"
         none = "no number of units that differ as those of the study do would decide: leave out those unlike the others"
-        reasons.append(needs if fewest else none)
+        reasons.append(needs if row["fewest_units"] else none)
     if row.get("level_db") is not None:
         few = f", from {row['level_units']} units of which {FEWEST_UNITS} are needed"
         place = f"{abs(row['level_db']):.2f} dB {'over' if row['level_db'] > 0 else 'below'} the monitor's bound"

@@ -207,7 +207,7 @@ def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn
     }
     for column in columns:
         parts = [part for part, of in named.items() if column in of]
-        if len(parts) > 1:
+        if parts[1:]:
             problem = f"--measured and --input both name the column {column.name!r}"
             raise ConfigError(f"Roles: {problem}; name it in one of them.")
         part = freed[column.part] if named.get(column.part) else column.part

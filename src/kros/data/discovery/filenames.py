@@ -61,11 +61,9 @@ def infer_names(paths: Sequence[str]) -> tuple[str, str | None]:
 
 def _counts(words: Sequence[str]) -> bool:
     """Tell whether words are one text with the numbers from 0 or 1 on, which may number units or episodes."""
-    matches = [re.fullmatch(r"(\D*)(\d+)", w) for w in words]
-    if not all(matches) or len({match[1] for match in matches if match}) > 1:
-        return False
-    numbers = sorted({int(match[2]) for match in matches if match})
-    return len(numbers) > 1 and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == len(numbers) - 1
+    alike = len({re.sub(r"\d+", "", w) for w in words}) == 1
+    numbers = sorted({int(re.sub(r"\D", "", w) or -1) for w in words})
+    return alike and len(numbers) > 1 and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == len(numbers) - 1
 
 
 def _cut(stems: Sequence[str]) -> Cut | None:

@@ -194,8 +194,7 @@ class FieldRecordings:
 
     def estimates(self) -> Iterator[Estimated]:
         """Run the observer over all episodes, every block behind the samples that late measurements are read from."""
-        observer, n = self.observer, len(self.observer.recorded)
-        late = delay_of(observer.sensor)
+        observer, late = self.observer, delay_of(self.observer.sensor)
         for key in self.population.episodes:
             start, course = 0, None
             loop = None if self.name is None else PhaseLockedLoop(observer, self.name, 1)
@@ -205,7 +204,7 @@ class FieldRecordings:
                 arrived = arriving(observer, self.population, {key: values}, self.values)
                 course = course or Course(observer, 1, arrived.parameters, loop)
                 run = course.take(arrived.y[lead:], arrived.u[lead:])
-                columns = run.estimates[:, 0, :n]
+                columns = run.estimates[:, 0, : len(observer.recorded)]
                 if loop is not None:
                     columns = np.column_stack([columns, np.broadcast_to(run.followed, run.status.shape)[:, 0]])
                 yield key, start, columns, run.status[:, 0], block

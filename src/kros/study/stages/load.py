@@ -52,8 +52,8 @@ def require_load(config: LoadConfig, population: Population) -> None:
     known = {*population.unit_ids, *population.states}
     missing = [name for name in (*config.units, TRIAL.angle, TRIAL.current) if name not in known]
     if config.moment is not None and missing:
-        there = f"there is no unit or state {missing[0]!r} in {some(population.unit_ids)} or {some(population.states)}"
-        raise ConfigError(f"load: {there}; correct the name.")
+        there = f"{some(population.unit_ids)} or {some(population.states)}"
+        raise ConfigError(f"load: there is no unit or state {missing[0]!r} in {there}; correct the name.")
 
 
 def run_load(context: Context, observers: Mapping[str, Observer]) -> None:

@@ -91,13 +91,12 @@ class OutlierModel(Storable):
             raise DataError(f"Scoring unit {unit}: {len(rows)} others are left, two are needed; record more units.")
         G = check_responses([*self.responses[:1], response], ("those scored", unit), self.freqs_hz)[1]
         comparison = self._comparison(rows, G / self.output_scale[:, None] * self.input_scale)
-        beyond = float(margins(comparison.distances.levels, comparison.inliers, comparison.rate)[1][-1])
-        (score,) = comparison.scores((unit,), self.threshold_db, {len(rows): beyond})
+        beyond = margins(comparison.distances.levels, comparison.inliers, comparison.rate)[1][-1:]
+        (score,) = comparison.scores((unit,), self.threshold_db, beyond)
         level = comparison.distances.levels[-1]
         motion = 0.0 if motion_db is None else 10 ** (motion_db / 20)
         rest = np.maximum(10 ** (level / 20) - motion, OUTLIER.least)
-        certain = beyond - float(level.max() - 20 * np.log10(rest.max()))
-        other = score.outlier and certain <= 0
+        other = score.outlier and beyond[0] <= level.max() - 20 * np.log10(rest.max())
         return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if other else score
 
     def _comparison(self, rows: AnyArray, response: AnyArray) -> Comparison:
@@ -193,6 +192,6 @@ def score_outliers(
     parts = separate(found.levels, rate)
     comparison = Comparison(form, G, freqs, found, parts.inliers, rate)
     inliers = np.flatnonzero(parts.inliers)
-    scores = comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist())))
+    scores = comparison.scores(ids, parts.threshold_db, parts.margin_db)
     names = tuple(ids[k] for k in inliers)
     return OutlierModel(form, names, freqs, G[inliers], *scales, scores, parts.threshold_db, rate)

@@ -78,18 +78,18 @@ class Comparison:
     inliers: Flags
     rate: float  # of false alarms
 
-    def scores(self, ids: tuple[str, ...], threshold: float, margin_db: dict[int, float]) -> tuple[OutlierScore, ...]:
-        """Return scores of the units with margins, whose names are given."""
-        levels, units = self.distances.levels, np.array(list(margin_db))
+    def scores(self, ids: tuple[str, ...], threshold: float, margin_db: AnyArray) -> tuple[OutlierScore, ...]:
+        """Return scores of the last units, whose names and margins are given."""
+        levels, scores = self.distances.levels, []
         excess, by_nominal = (excesses(v, self.inliers) for v in (levels.max(axis=1), self.distances.peaks))
-        lowest, highest = np.nanmin(by_nominal, axis=0), np.nanmax(by_nominal, axis=0)
-        freqs, scores, known = self.freqs_hz[levels.argmax(axis=1)], [], bool(np.isfinite(threshold))
-        for unit, name in zip(units, ids, strict=True):
-            value, margin = float(excess[unit]), margin_db[int(unit)]
-            levels_db = value, float(lowest[unit]), float(highest[unit])
+        ends = np.array([np.nanmin(by_nominal, axis=0), np.nanmax(by_nominal, axis=0)]).T.tolist()
+        freqs, known = self.freqs_hz[levels.argmax(axis=1)], bool(np.isfinite(threshold))
+        for unit, (name, margin) in enumerate(zip(ids, margin_db.tolist(), strict=True), len(levels) - len(ids)):
+            value = float(excess[unit])
             score_db = threshold + margin if known else value
-            score = OutlierScore(name, score_db, threshold, known and margin > 0, float(freqs[unit]), *levels_db)
-            scores.append(self._detectable(score, int(unit), value - margin))
+            beyond, hz = known and margin > 0, float(freqs[unit])
+            score = OutlierScore(name, score_db, threshold, beyond, hz, value, *ends[unit])
+            scores.append(self._detectable(score, unit, value - margin))
         return tuple(scores)
 
     def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:

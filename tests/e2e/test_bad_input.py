@@ -58,12 +58,25 @@ def test_missing_study(kros, tmp_path):
         ("[estimator]\nrows = 4", ("estimator", "rows", "1000")),
         ("[calibrate]\nangle = 'theta'", ("theta", "position")),
         ("[split]\ntest = ['0', '1', '2', '3']", ("split.test",)),
+        ("[split]\ntest = ['0', '99']", ("split.test: no episode is named 99; there are 0, 1, 2",)),
+        ("[identify]\nalpha = true", ("identify.alpha: input should not be true or false, found True",)),
+        ("[estimator]\nlimits = {current = [1.0, -1.0]}", ("estimator.limits: current = [1, -1] should be the least",)),
+        ("[estimator]\nlimits = {nobody = [-1.0, 1.0]}", ("estimator.limits: nobody = [-1, 1] should be",)),
+        ("[load]\nmoment = 1.0\nunits = ['nobody']", ("load: there is no unit or state 'nobody' in 000000, 001001",)),
+        ("[sensor.position]\nnoise = 1e300", ("at most 1e+50", "found 1e+300")),
         ("[data.csv]\nfiles = 1\n[data.x]", ("data.x",)),
         ("not toml", ("TOML",)),
     ],
 )
 def test_bad_studies(kros, study, tmp_path, extra, words):
     refused(kros, study(extra), tmp_path, *words)
+
+
+def test_a_function_that_is_not_finite_on_the_recordings(kros, study, tmp_path):
+    path, out = study("[lifting]\nfunctions = ['log(velocity)']"), tmp_path / "out"
+    result = kros("run", path, "--out", out, "--until", "identify")
+    assert result.exit_code == 2
+    assert "log(velocity) is not finite, or huge; use functions that are moderate on all recordings" in result.stderr
 
 
 def test_unknown_condition(kros, study, tmp_path):

@@ -128,6 +128,13 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
         or EpisodeKey(units[1], "default", "01") not in found.episodes
     )
     assert kros("run", study, "--out", tmp_path / "run", "--until", "read").exit_code == 0
+    for change, message in (
+        ("threshold=nan", "CSV mapping: threshold: input should be a finite number, found nan."),
+        ("encoding=utf-16", "its first lines are not UTF-16 (UTF-16 stream does not start with BOM)"),
+        ("pieces=100000", "pieces: input should be less than or equal to 1000, found 100000"),
+    ):
+        result = kros("run", study, "--out", tmp_path / "no", "--until", "read", "--set", f"data.csv.{change}")
+        assert (result.exit_code, message in result.stderr) == (2, True), result.stderr
 
 
 def test_roles_are_taken_from_options(kros, tmp_path, motors):
@@ -147,6 +154,8 @@ def test_roles_are_taken_from_options(kros, tmp_path, motors):
     name = "no column is a measured state by its name; name it, --measured NAME. The columns are aa, bb, cc, dd"
     refused(name, *period)
     refused("there is no column 'd'", *period, "--measured", "aa", "--input", "d")
+    refused("--measured and --input both name the column 'aa'", *period, "--measured", "aa", "--input", "aa")
+    refused("sample_period_s: input should be greater than 0, found 0.0", "--period", 0, *roles)
     result = kros("init", folder, "--out", study, *period, *roles)
     assert result.exit_code == 0, result.output
     found = open_source(load_config(study))
@@ -156,17 +165,26 @@ def test_roles_are_taken_from_options(kros, tmp_path, motors):
     assert study.read_bytes() == before
 
 
-def test_columns_of_one_name_are_told_apart(kros, tmp_path, motors):
-    form = {"delimiter": ",", "header": "time,position,velocity,velocity,u", "comments": "", "fmt": "%.12g"}
-    for key in motors.episodes[:8]:
-        path = tmp_path / "doubled" / key.unit / f"run_{key.episode}.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        values = motors.read(key)
-        np.savetxt(path, np.column_stack([motors.sample_period_s * np.arange(len(values)), values]), **form)
-    result = kros("init", tmp_path / "doubled", "--out", tmp_path / "study.toml")
+def test_columns_of_one_name_are_told_apart_and_reserved_names_are_not_taken(kros, tmp_path, motors):
+    def folder(name: str, header: str):
+        form = {"delimiter": ",", "header": header, "comments": "", "fmt": "%.12g"}
+        for key in motors.episodes[:8]:
+            path = tmp_path / name / key.unit / f"run_{key.episode}.csv"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            values = motors.read(key)
+            np.savetxt(path, np.column_stack([motors.sample_period_s * np.arange(len(values)), values]), **form)
+        return tmp_path / name
+
+    doubled, key = folder("doubled", "time,position,velocity,velocity,u"), motors.episodes[0]
+    named = kros("init", doubled, "--out", tmp_path / "none.toml", "--measured", "time")
+    assert "no column 'time'; beside time there are position, velocity, velocity_2 ('velocity'), u" in named.stderr
+    result = kros("init", doubled, "--out", tmp_path / "study.toml")
     assert result.exit_code == 0, result.output
-    found, key = open_source(load_config(tmp_path / "study.toml")), motors.episodes[0]
+    found = open_source(load_config(tmp_path / "study.toml"))
     np.testing.assert_allclose(found.read(key)[:, 2], motors.read(key)[:, 2])
+    reserved, both = folder("reserved", "time,k,unit,current,u"), ("--measured", "k", "--measured", "unit")
+    assert kros("init", reserved, "--out", tmp_path / "reserved.toml", *both).exit_code == 0
+    assert open_source(load_config(tmp_path / "reserved.toml")).states == ("k_2", "unit_2", "current")
 
 
 def test_single_samples_without_a_value_cost_no_episode(kros, tmp_path, motors):

@@ -161,6 +161,11 @@ def test_another_rate(folder: Path) -> None:
             r"role: input should be 'state', 'input' or 'truth', found 'output'",
         ),
         ({"channel": []}, r"there is no \[\[channel\]\]"),
+        ({"files": "(?P<Unit>.)"}, "files: names the group 'Unit'; known groups are unit, .*, found '[(][?]P<Unit>"),
+        (
+            {"channel": [{"name": "x", "role": "state", "column": "a"}, {"name": "y", "role": "input", "column": "a"}]},
+            r"mapping: every channel needs a column of its own, found \['a', 'a'\]",
+        ),
         ({"files": "("}, r"files: input is not a regular expression .*, found '\('"),
         ({"files": "(?P<run>a)"}, "names the group 'run'; known groups are unit, condition, episode, group"),
         ({"time": None}, "one of time and sample_period_s"),

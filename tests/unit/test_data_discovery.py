@@ -203,6 +203,8 @@ def test_lines_before_the_numbers(tmp_path: Path):
     )
     path.write_text("1;2\n3;4\n5;6\n")
     assert not look_at(path).dialect.header
+    path.write_text("1,2\nfoo\n3,4\nfoo\n")  # no two rows of numbers side by side
+    assert (look_at(path).fields, look_at(path).dialect.header) == (("1", "2"), False)
     path.write_text("once upon a time\nthere was; a table\n")
     with pytest.raises(DataError, match=r"a\.csv: no rows of numbers were found in its first 2 lines"):
         look_at(path)

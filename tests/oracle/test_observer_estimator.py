@@ -23,6 +23,7 @@ from kros.observer.estimator.gaps import decay
 from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Moments, Readout, Whitening
 from kros.observer.estimator.rows import Design, interpolated
+from kros.observer.simulate import Course
 
 
 def design(recordings, family="linear", settings=FEW):
@@ -80,8 +81,8 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     made = design(recordings)
     whitening = Whitening.of(made)
     (moments,) = Moments.of([made], [whitening])
-    penalty, share = 1e-6, 0.1
-    (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, share)])
+    penalty, start, share = 1e-6, 0.2, 0.1
+    (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, start, share)])
     parts: dict = {}
     for key, rows, targets, weights in made.rows(recordings, FEW.rows):
         parts.setdefault(made.groups[key], []).append((rows @ whitening.directions, targets, weights))
@@ -90,7 +91,8 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
         size = np.sqrt(sum(w.sum() for *_, w in own) * len(parts))
         X += [F * np.sqrt(w)[:, None] / size for F, _, w in own]
         T += [t * np.sqrt(w)[:, None] / size for _, t, w in own]
-    prior = whitening.trust + share * whitening.disturbed + penalty * np.diag(whitening.penalty)
+    errors = whitening.trust + start * whitening.elsewhere + share * whitening.disturbed
+    prior = errors + penalty * np.diag(whitening.penalty)
     root = np.linalg.cholesky(prior).T
     stacked = np.vstack([*X, root]), np.vstack([*T, np.zeros((len(root), 3))])
     np.testing.assert_allclose(found, np.linalg.lstsq(*stacked, rcond=None)[0], atol=1e-6 * np.abs(found).max())
@@ -202,7 +204,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (bank.delays - 1))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = made.errors(X)[-1][-1]
+    moved = made.errors(X)[-1][-1][-1]
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
@@ -381,11 +383,11 @@ def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well()
             for k in range(399):
                 x[k + 1] = [[1.0, 0.01], [-0.5, 0.9]] @ x[k] + [0.0, 0.5 * u[k, 0] - 0.2 * np.sin(5 * x[k, 0])]
             key = EpisodeKey(unit, "default", str(episode))
-            batches[key] = batch_of(x[:, None] + 1e-3 * rng.standard_normal((400, 1, 2)), u[:, None], 0.01)
+            batches[key] = batch_of(x[:, None] + 1e-5 * rng.standard_normal((400, 1, 2)), u[:, None], 0.01)
     recordings = Recordings.of([key for key in batches if key.episode != "5"], batches.__getitem__)
     errors = []
-    for share in (0.0, 0.1):
-        chosen = EstimatorSettings(delays=16, rows=20_000, start_share=share)
+    for shares in ({"start_share": 0.0, "restart_share": 1e-12}, {}):
+        chosen = EstimatorSettings(delays=16, rows=20_000, **shares)
         lifting = Lifting(("position", "velocity"))
         observer = identify_estimator("e", lifting, (0,), ("u",), recordings, 0.01, settings=chosen).observer
         unseen = [b for key, b in batches.items() if key.episode == "5"]
@@ -418,9 +420,9 @@ def test_candidates_are_compared_without_groups_in_which_a_state_rests():
     errors[:, 2:] = 0.1  # the other penalty is no better
     errors[parts < 2, 2:, 0] = -60.0  # but where the first state is zero
     resting = replace(moments, power=np.where((parts < 2)[:, None] & (np.arange(3) == 0), 0.0, 1.0))
-    np.testing.assert_array_equal(resting.best(errors, 2), [[0, 0, 0], [1, 1, 1]])
+    np.testing.assert_array_equal(resting.best(errors), [[0, 0, 0], [1, 1, 1]])
     errors[:, 2:] = -0.3
-    np.testing.assert_array_equal(resting.best(errors, 2), [[2, 2, 2], [3, 3, 3]])
+    np.testing.assert_array_equal(resting.best(errors), [[2, 2, 2], [3, 3, 3]])
 
 
 def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():
@@ -491,12 +493,12 @@ def test_gaps_are_bridged_by_straight_lines_through_functions_too():
     rng, length, begin, apart = np.random.default_rng(0), 12, 20, []
     y, u = 0.1 * rng.normal(size=(40, 1, 1)), rng.normal(size=(40, 1, 2))
     y[begin : begin + length] = np.nan
-    expected = run_observer(bank, y, u)[:, 0, 0]
+    expected = Course(bank).take(y, u).estimates[:, 0, 0]
     for jump in (1e-5, 5e-6):
         y[begin + length] = expected[begin + length] + jump * (length + 1)
         line = y.copy()
         line[begin : begin + length, 0, 0] = expected[begin : begin + length] + jump * np.arange(1, length + 1)
-        after, wanted = (run_observer(bank, one, u)[begin + length + 1, 0, 3:5] for one in (y, line))
+        after, wanted = (Course(bank).take(one, u).estimates[begin + length + 1, 0, 3:5] for one in (y, line))
         apart.append(np.abs(after - wanted))
     np.testing.assert_allclose(apart[0] / apart[1], 4.0, rtol=0.1)
 

@@ -19,6 +19,7 @@ from ...core import EPS, ROUNDING, AnyArray, Array, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
 from .rows import Design, Group, Recordings, in_step
 
+Candidate = tuple[float, float, float]  # penalty, and weights of starts elsewhere and of restarts
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
 
 
@@ -31,6 +32,7 @@ class Whitening:
     penalty: Array  # (r,), 1 / sigma^2
     trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
     disturbed: Array  # (r, r), the same after a start in the middle of an episode or a loss
+    elsewhere: Array  # (r, r), the same of a start at another place
 
     @classmethod
     def of(cls, design: Design) -> Whitening:
@@ -39,14 +41,17 @@ class Whitening:
         bank, settings = design.bank, design.settings
         size = bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
-        errors = [(one, other, few_columns(wrong * scale)) for one, other, wrong in design.errors(X)]
-        trust = np.vstack([np.diag(bank.trust(settings.nonlinear_trust)), *(np.sqrt(one) * R for one, _, R in errors)])
-        disturbed = np.vstack([np.sqrt(other) * R for _, other, R in errors])
-        least = np.sqrt(settings.settled_share) * disturbed
-        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, least])))
+        restarts, others, errors = design.errors(X)
+        disturbed, elsewhere = few_columns(restarts * scale), few_columns(others * scale)
+        wrong = [np.sqrt(share) * few_columns(one * scale) for share, one in errors]
+        trust = np.vstack([np.diag(bank.trust(settings.nonlinear_trust)), *wrong])
+        starts = np.sqrt(settings.settled_share) * disturbed, np.sqrt(settings.start_share) * elsewhere
+        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, *starts])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
-        moments = (rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, disturbed)))
+        moments = (
+            rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, disturbed, elsewhere))
+        )
         return cls(sample, directions, sigma[:count] ** -2.0, *moments)
 
 
@@ -99,8 +104,8 @@ class Moments:
         found = self.power[groups] - 2 * np.einsum("in,gin->gn", coefficients, self.cross[groups]) + quadratic
         return np.maximum(found, 1e-30)
 
-    def solved(self, weights: Array, candidates: Sequence[tuple[float, float]]) -> Iterator[Array]:
-        """Yield ridge coefficients (r, n) of groups with weights, for every penalty and weight of restarts."""
+    def solved(self, weights: Array, candidates: Sequence[Candidate]) -> Iterator[Array]:
+        """Yield ridge coefficients (r, n) of groups with weights, for every candidate."""
         from scipy.linalg import cho_factor, cho_solve
 
         weights = weights / weights.sum()
@@ -108,21 +113,22 @@ class Moments:
         gram = np.tensordot(weights, self.gram, 1) + whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 16 * len(gram) * EPS
-        for penalty, share in candidates:
-            A = gram + share * whitening.disturbed + np.diag(penalty * whitening.penalty)
+        for penalty, start, restart in candidates:
+            errors = start * whitening.elsewhere + restart * whitening.disturbed
+            A = gram + errors + np.diag(penalty * whitening.penalty)
             q = 1 / np.sqrt(np.diag(A))
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
-    def best(self, errors: Array, weights: int) -> list[Whole]:
-        """Return the best candidates of every state for each of several weights of restarts, in turn the last index.
+    def best(self, errors: Array) -> Whole:
+        """Return the best candidates of every state for each pair of weights, which come in turn, shape (2, n).
 
         They are best by logarithms of errors (groups, candidates, n) on what is left out.
         """
         # A state at zero throughout a group would ask for no estimate of it at all.
         counted = (self.power > 0)[:, None]
         mean = errors.mean(axis=0, where=counted | ~counted.any(axis=0))
-        return [mean[i::weights].argmin(axis=0) * weights + i for i in range(weights)]
+        return np.stack([2 * mean[i::2].argmin(axis=0) + i for i in range(2)])
 
     def known(self, group: Group) -> Flags:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
@@ -130,7 +136,7 @@ class Moments:
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
         return next(known for known in (folds & parts, folds, parts, folds | True) if (known & alike).any())
 
-    def without(self, weights: Array, candidates: Sequence[tuple[float, float]]) -> dict[Group, list[Array]]:
+    def without(self, weights: Array, candidates: Sequence[Candidate]) -> dict[Group, list[Array]]:
         """Return the coefficients that do not know a group, for every group and candidate."""
         known = {group: self.known(group) for group in self.groups}
         several = {rest.tobytes(): np.where(rest, weights, 0.0) for rest in known.values()}
@@ -148,7 +154,7 @@ class Readout:
     careful: Array  # (p, n), for the time after a start or a loss
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
-    penalties: Array  # (n, 2), and weights of restarts
+    penalties: Array  # (n, 3), and weights of starts elsewhere and of restarts
     others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
     careful_others: dict[Group, Array]
 
@@ -164,11 +170,12 @@ class Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = moments.whitening
         weights, settings = condition_weights(moments), design.settings
-        candidates = [*product(settings.penalties, (settings.settled_share, settings.restart_share))]
+        pairs = (0.0, settings.settled_share), (settings.start_share, settings.restart_share)
+        candidates = [(penalty, *pair) for penalty, pair in product(settings.penalties, pairs)]
         others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         errors = np.array(left_out)
-        n, (best, careful) = np.arange(errors.shape[2]), moments.best(np.log(errors), 2)
+        n, (best, careful) = np.arange(errors.shape[2]), moments.best(np.log(errors))
         every = np.array(list(moments.solved(weights, candidates)))
         coefficients = every[best, :, n].T
         return cls(
@@ -226,6 +233,6 @@ def condition_weights(moments: Moments) -> Array:
     """Return weights of the groups: by rows within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
     alike = conditions[:, None] == conditions
-    (first,) = moments.solved(moments.rows, [(ROUNDING, 1.0)])
+    (first,) = moments.solved(moments.rows, [(ROUNDING, 0.0, 1.0)])
     errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
     return moments.rows / (alike @ moments.rows) * alike.sum(axis=1) ** 2 / (alike @ errors)

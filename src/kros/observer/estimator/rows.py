@@ -181,8 +181,11 @@ class Design:
         weight = np.concatenate([weights for *_, weights in found])
         return np.vstack([rows for _, rows, *_ in found]), weight / weight.sum()
 
-    def errors(self, rows: Array) -> list[tuple[float, float, Array]]:
-        """Return by how much rows of `sample` may be wrong, with weights for all time and after a disturbance."""
+    def errors(self, rows: Array) -> tuple[Array, Array, list[tuple[float, Array]]]:
+        """Return by how much rows of `sample` change with a start in motion, with one elsewhere, and other errors.
+
+        The others have weights.
+        """
         settings, bias, rng = self.settings, self.recordings.bias, np.random.default_rng(self.settings.seed)
         biased, bridged, restarts, elsewhere = (list[Array]() for _ in range(4))
         for _, batch, at, _ in self.episodes(self.recordings.some(settings.sample_episodes), settings.sample):
@@ -199,10 +202,9 @@ class Design:
                 bridged.append(self.seen(self.signals(batch, line), at))
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
                 biased.append(self.seen(self.signals(batch, y + bias), at))
-        errors = [(0.0, 1.0, np.vstack(restarts)), (settings.start_share, 0.0, np.vstack(elsewhere))]
-        for share, wrong in ((settings.gap_share, bridged), (1.0, biased)):
-            errors += [(share, 0.0, np.vstack(wrong) - rows)] if wrong else []
-        return errors
+        wrong = [(settings.gap_share, bridged), (1.0, biased)]
+        others = [(share, np.vstack(parts) - rows) for share, parts in wrong if parts]
+        return np.vstack(restarts), np.vstack(elsewhere), others
 
     def measurements(self, batch: EpisodeBatch) -> Array:
         """Return the measurements of an episode, (n_samples, q), with straight lines over missing ones."""

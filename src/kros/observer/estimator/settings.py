@@ -61,13 +61,13 @@ class EstimatorSettings(Settings):
     start_share: float = Field(
         0.1,
         ge=0,
-        description="weight of the errors that the first sample makes at another place: rows with target zero",
+        description="weight of the errors that the first sample makes at another place, for the time after a start or "
+        "a loss: rows with target zero, since machines start elsewhere than in recordings",
     )
     restart_share: float = Field(
         0.03,
         gt=0,
-        description="weight of the errors that a start in the middle of an episode makes, for the time after a start "
-        "or a loss: rows with target zero, since machines start elsewhere than in recordings",
+        description="weight of the errors that a start in the middle of an episode makes, for the same time",
     )
     settled_share: float = Field(1e-3, gt=0, description="weight of these errors for all other time")
     gap_share: float = Field(

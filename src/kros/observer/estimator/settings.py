@@ -59,7 +59,7 @@ class EstimatorSettings(Settings):
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )
     start_share: float = Field(
-        0.1,
+        0.2,
         ge=0,
         description="weight of the errors that the first sample makes at another place, for the time after a start or "
         "a loss: rows with target zero, since machines start elsewhere than in recordings",

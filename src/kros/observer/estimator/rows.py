@@ -182,10 +182,7 @@ class Design:
         return np.vstack([rows for _, rows, *_ in found]), weight / weight.sum()
 
     def errors(self, rows: Array) -> tuple[Array, Array, list[tuple[float, Array]]]:
-        """Return by how much rows of `sample` change with a start in motion, with one elsewhere, and other errors.
-
-        The others have weights.
-        """
+        """Return what rows of `sample` change by with later starts, with one elsewhere, and by others with weights."""
         settings, bias, rng = self.settings, self.recordings.bias, np.random.default_rng(self.settings.seed)
         biased, bridged, restarts, elsewhere = (list[Array]() for _ in range(4))
         for _, batch, at, _ in self.episodes(self.recordings.some(settings.sample_episodes), settings.sample):

@@ -373,6 +373,17 @@ def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_to
     assert errors[1][0] < 0.05 * speed
 
 
+def test_a_machine_without_inputs_has_an_estimator():
+    batches = {k: replace(b, inputs=b.inputs[..., :0]) for k, b in from_rest([-2.0, -1.0, 0.5, 1.5], 1)[1].items()}
+    recordings = Recordings.of(list(batches), batches.__getitem__)
+    observer = identify_estimator(
+        "e", Lifting(("position", "velocity")), (0,), (), recordings, 0.01, settings=FEW
+    ).observer
+    batch = next(iter(batches.values()))
+    speed = run_observer(observer, batch.states[..., :1], batch.inputs)[:, 0, 1]
+    assert np.std(speed - batch.states[:, 0, 1]) < 0.1 * np.std(batch.states[:, 0, 1])
+
+
 def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well():
     rng, batches = np.random.default_rng(0), {}
     for episode, place in enumerate([1.0, 1.1, 1.25, 1.4, 1.5, -2.0]):

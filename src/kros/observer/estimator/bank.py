@@ -84,13 +84,13 @@ class Bank:
         filters = np.multiply(moving, [len(self.lags), len(self.resonances), len(self.resonances)])
         ends = np.cumsum([moving, (self.delays - 1) * self.delayed, *filters])
         _, _, lags, real, imaginary, _ = np.split(past, ends, axis=1)
-        steps, delay = now[:, ends[0] : ends[1]].reshape(count, -1, self.delayed), np.arange(self.delays - 1)
-        steps = np.where((delay >= age)[..., None], -steps, 0.0)
+        steps, delay = now[:, ends[0] : ends[1]], np.arange(self.delays - 1)
+        steps = np.where((delay >= age)[..., None], -steps.reshape(count, len(delay), self.delayed), 0.0)
         steps -= (delay == age - 1)[..., None] * other[:, None, : self.delayed]
         parts = [np.where(age == 0, other, 0.0), steps.reshape(count, -1)]
         for tau, filtered in ((self.lags, lags), (self.resonances, real + 1j * imaginary)):
             gone = np.exp(-age / np.array(tau))[..., None]
-            change = (gone * (first[:, None, :-1] - filtered.reshape(count, -1, moving))).reshape(count, -1)
+            change = (gone * (first[:, None, :-1] - filtered.reshape(count, len(tau), moving))).reshape(count, -1)
             parts += [change.real, change.imag] if np.iscomplexobj(change) else [change]
         starts = self.started(first, age[:, 0]) - self.started(v[0], at)
         return np.hstack([*parts, starts, np.zeros((count, 1))])

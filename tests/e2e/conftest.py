@@ -28,7 +28,6 @@ rows = 4000
 episodes = 16
 sample = 1500
 sample_episodes = 8
-restarts = 2
 features = 8
 folds = 2
 parts = 2

@@ -68,6 +68,7 @@ def load_observer(
         delays=settings.delays,
         first_lag=lag,
         last_lag=lag / recordings.length,
+        start_share=settings.restart_share,
         restart_share=settings.restart_share,
         settled_share=settings.restart_share,
     )

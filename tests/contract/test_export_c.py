@@ -12,8 +12,10 @@ from machines import LIMITS, MACHINES, apart, drive, in_python, samples, watched
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, LoadOutput, export_c
 from kros.export.c99.write import Golden
+from kros.lifting import Lifting
 from kros.loops.compiler import find_compiler
 from kros.motor_drive import AngleLoad
+from kros.observer import Observer, Runtime, SampleStatus
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Werror", "-pedantic")
 TRAPPED = ("-fsanitize=undefined", "-fsanitize-undefined-trap-on-error", "-Wno-unused-function", "-O0")
@@ -196,3 +198,11 @@ def test_a_folder_with_content_is_left_alone(tmp_path):
     with pytest.raises(DataError, match="not empty"):
         export_c(drive(), tmp_path, "drive")
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_an_estimate_within_rounding_of_its_limit_is_not_sure_to_be_inside():
+    lag = Observer.open_loop("lag", Lifting(("x",)), np.zeros((1, 1)), np.ones((1, 1)), (0,), ("u",), 0.01)
+    limited = replace(lag, runtime=Runtime(upper=np.array([0.5 + 1e-6])))
+    golden = Golden.of(limited, tolerance=1e-3)
+    assert not (golden.status & SampleStatus.LIMIT).any()
+    assert 0 < np.sum(golden.sure[0] & SampleStatus.LIMIT == 0) < len(golden.status)

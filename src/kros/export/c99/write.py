@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ...core import AnyArray, Array, Record, frozen, whole_folder, write_bytes
 from ...core.artifacts import json_bytes, with_checksum
-from ...observer import Observer
+from ...observer import Observer, SampleStatus
 from ...observer.file import observer_content
 from .numbers import TOLERANCE, LoadOutput, Source
 
@@ -157,7 +157,7 @@ class Golden:
     status: AnyArray  # (n_samples,)
     passes: int
     last_status: AnyArray  # (n_samples,)
-    # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
+    # (2, n_samples): bits of `status` and `last_status` that no change of signals by the tolerance turns over
     sure: AnyArray
 
     @classmethod
@@ -182,10 +182,14 @@ class Golden:
                 running.track(track)
             samples = [*zip(factor * y, factor * u, strict=True)] * passes
             steps = [(np.asarray(running.step(*sample)), int(running.status)) for sample in samples]
-            x_hat = np.array([x for x, _ in steps[:count]])
-            return x_hat, np.array([s for _, s in steps], np.uint32)
+            return np.array([x for x, _ in steps]), np.array([s for _, s in steps], np.uint32)
 
         x_hat, status = run(1.0)
         turned = (run(1 - tolerance)[1] ^ status) | (run(1 + tolerance)[1] ^ status)  # at a threshold but for rounding
+        low, high = observer.runtime.sides(x_hat.shape[1])
+        near = tolerance * np.abs(x_hat).max(axis=0)
+        turned |= np.where(
+            ((x_hat <= low + near) | (x_hat >= high - near)).any(axis=1), np.uint32(SampleStatus.LIMIT), 0
+        )
         sure = ~np.stack([turned[:count], turned[-count:]])
-        return cls(y, u, x_hat, status[:count], passes, status[-count:], sure)
+        return cls(y, u, x_hat[:count], status[:count], passes, status[-count:], sure)

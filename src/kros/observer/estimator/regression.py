@@ -42,8 +42,8 @@ class Whitening:
         size = bank.sizes(np.sqrt(weights @ (X * X)))
         scale = np.sqrt(weights)[:, None] / size
         restarts, others, errors = design.errors(X)
-        disturbed, elsewhere = few_columns(restarts * scale), few_columns(others * scale)
-        wrong = [np.sqrt(share) * few_columns(one * scale) for share, one in errors]
+        disturbed, elsewhere = sparse_triangle(restarts * scale), sparse_triangle(others * scale)
+        wrong = [np.sqrt(share) * sparse_triangle(one * scale) for share, one in errors]
         trust = np.vstack([np.diag(bank.trust(settings.nonlinear_trust)), *wrong])
         starts = np.sqrt(settings.settled_share) * disturbed, np.sqrt(settings.start_share) * elsewhere
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, *starts])))
@@ -55,8 +55,8 @@ class Whitening:
         return cls(sample, directions, sigma[:count] ** -2.0, *moments)
 
 
-def few_columns(rows: Array) -> Array:
-    """Return the triangle of rows, of which most may be zero in most columns."""
+def sparse_triangle(rows: Array) -> Array:
+    """Return the triangle of a QR decomposition of rows, many columns of which are zero."""
     used = rows.any(axis=0)
     triangle = qr_triangle(rows[:, used])
     found = np.zeros((len(triangle), rows.shape[1]))

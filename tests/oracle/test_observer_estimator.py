@@ -68,6 +68,20 @@ def test_a_bank_is_its_system():
         np.testing.assert_allclose(bank.restarted(v, first, begin, at)[some], alone, atol=1e-12)
 
 
+def test_banks_of_families_are_parts_of_the_richer_one():
+    recordings, _ = plant(units=2, spread=0.1)
+    *parts, whole = (design(recordings, family) for family in FAMILIES[:3])
+    (_, rows, *_), *_ = whole.rows(recordings, FEW.rows)
+    for part in parts:
+        (_, wanted, *_), *_ = part.rows(recordings, FEW.rows)
+        places = whole.bank.places(part.bank)
+        np.testing.assert_allclose(rows[:, places], wanted, atol=1e-12)
+        one, other = whole.sample().of(places), part.sample()
+        for name in ("rows", "restarts", "elsewhere", "errors"):
+            a, b = getattr(one, name), getattr(other, name)
+            np.testing.assert_allclose(a.T @ a, b.T @ b, atol=1e-12 * np.abs(b).max(initial=0.0) ** 2, err_msg=name)
+
+
 def test_a_lifting_that_makes_models_affine_has_the_same_channels():
     ranges = {"position": (-3.0, 3.0), "u": (-3.0, 3.0)}
     affine = replace(LIFTING, inputs=("u",), input_functions=("1",))
@@ -79,7 +93,7 @@ def test_a_lifting_that_makes_models_affine_has_the_same_channels():
 def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     recordings, _ = plant(units=3, spread=0.1)
     made = design(recordings)
-    whitening = Whitening.of(made)
+    whitening = Whitening.of(made, made.sample())
     (moments,) = Moments.of([made], [whitening])
     penalty, start, share = 1e-6, 0.2, 0.1
     (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, start, share)])
@@ -167,7 +181,7 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     others = [k for k in recordings.keys if k.unit != key.unit and k.episode != key.episode]
     alone = replace(recordings, keys=tuple(others), lengths=recordings.lengths[: len(others)])
     made = design(alone, settings=settings)
-    whitening = Whitening.of(readout.design)
+    whitening = Whitening.of(readout.design, readout.design.sample())
     (moments,) = Moments.of([made], [whitening])
     (coefficients,) = moments.solved(np.ones(len(moments.groups)), [tuple(readout.penalties[1])])
     group = readout.design.groups[key]
@@ -198,14 +212,12 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     recordings, batches = plant(units=3, spread=0.1)
     biased = replace(recordings, bias=np.array([0.5]))
     made = design(biased)
-    bank, X = made.bank, made.sample()[0]
-    expected = np.zeros_like(X)
+    bank = made.bank
     of_y = np.flatnonzero(bank.channel == 0)
-    now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (bank.delays - 1))
-    expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = made.errors(X)[-1][-1][-1]
-    np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
+    moved = np.isin(np.arange(len(bank)), np.setdiff1d(of_y[: -len(bank.starts)], delays))  # and not the first sample
+    errors = design(biased, settings=FEW.model_copy(update={"gap_share": 0.0})).sample().errors
+    np.testing.assert_allclose((errors.T @ errors)[moved][:, moved], 0.25, atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
         observer = identify_estimator("plant", LIFTING, (0,), ("u",), one, DT, settings=FEW).observer
@@ -425,7 +437,7 @@ def test_a_readout_of_its_own_counts_after_a_loss_until_the_slowest_filter_has_f
 def test_candidates_are_compared_without_groups_in_which_a_state_rests():
     recordings, _ = plant(units=3, episodes=3, spread=0.1)
     made = design(recordings, settings=FEW.model_copy(update={"parts": 3}))
-    (moments,) = Moments.of([made], [Whitening.of(made)])
+    (moments,) = Moments.of([made], [Whitening.of(made, made.sample())])
     parts = moments.of_groups("part")
     errors = np.zeros((len(parts), 4, 3))
     errors[:, 2:] = 0.1  # the other penalty is no better

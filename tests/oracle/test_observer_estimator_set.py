@@ -206,8 +206,11 @@ def test_functions_of_the_model_count_and_others_are_refused():
     assert np.any(estimate.B[:, 4])  # the sine, the fourth lifted state, behind one measurement and three states
     assert found.facts["outside_models_percent"] == dict.fromkeys(lifting.states, 0.0)
     design = found.readout.design
-    rows, weight = found.readout.sample
-    added = rows @ np.where(design.bank.channel[:, None] == 1, found.readout.coefficients, 0.0)  # the sine is channel 1
+    _, rows, _, weight = zip(
+        *design.rows(design.recordings.some(SETTINGS.sample_episodes), SETTINGS.sample), strict=True
+    )
+    of_sine = np.where(design.bank.channel[:, None] == 1, found.readout.coefficients, 0.0)  # the sine is channel 1
+    added, weight = np.vstack(rows) @ of_sine, np.concatenate(weight) / np.concatenate(weight).sum()
     shares, size = outside_percent(found.readout, LIFTING), design.recordings.size
     np.testing.assert_allclose(shares, 100 * np.sqrt(weight @ added**2) / size, rtol=1e-9)
     assert (shares > 0).all()

@@ -11,7 +11,8 @@ part. Before the first sample everything is taken to equal it. As a system, :mat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from ...core import ITERATED, Array, Whole, frozen
 from .channels import Channels
 from .settings import EstimatorSettings
 
-_BLOCK, _ROWS = 32, 1000  # samples of a block, and rows at a time
+_BLOCK, _ROWS = 32, 64  # samples of a block, and rows at a time: few, so that they stay in the cache
 
 
 @frozen
@@ -49,25 +50,47 @@ class Bank:
         return self.channels - 1 - self.memoryless
 
     def __len__(self) -> int:
-        return len(self.channel)
+        return len(self.entries)
+
+    @cached_property
+    def entries(self) -> list[tuple[str, complex, int]]:
+        """Filter with its delay or time constant, and channel of every entry; the constant channel is the last, -1."""
+        moving, delayed, every = range(self.channels - 1), range(self.delayed), (*range(self.channels - 1), -1)
+        filters: list[tuple[str, complex, Iterable[int]]] = [("value", 0, moving)]
+        filters += [("step", i, delayed) for i in range(1, self.delays)]
+        filters += [("lag", tau, moving) for tau in self.lags]
+        filters += [(part, tau, moving) for part in ("real", "imaginary") for tau in self.resonances]
+        filters += [("start", tau, every) for tau in self.starts]
+        return [(kind, tau, channel) for kind, tau, channels in (*filters, ("value", 0, (-1,))) for channel in channels]
 
     @property
     def channel(self) -> Whole:
         """Channel of every entry, shape (len(self),)."""
-        every, moving = np.arange(self.channels), np.arange(self.channels - 1)
-        steps = [moving[: self.delayed]] * (self.delays - 1)
-        lags = [moving] * (len(self.lags) + 2 * len(self.resonances))
-        return np.concatenate([moving, *steps, *lags, *[every] * len(self.starts), every[-1:]])
+        return np.array([channel for *_, channel in self.entries])
+
+    def places(self, part: Bank) -> Whole:
+        """Return where the entries of a part of this bank are, one with fewer filters or of fewer channels."""
+        places = {entry: place for place, entry in enumerate(self.entries)}
+        return np.array([places[entry] for entry in part.entries])
 
     def rows(self, v: Array, at: Whole) -> Array:
         """Return the bank at samples `at` of signals v (n_samples, channels), shape (len(at), len(self))."""
-        moving, past = v[:, :-1], v[:, : self.delayed]
-        steps = np.concatenate([np.zeros((self.delays, self.delayed)), np.diff(past, axis=0)])
-        parts = [moving[at], *(steps[at + self.delays - 1 - i] for i in range(self.delays - 1))]
-        for lags in filter(None, (self.lags, self.resonances)):
-            values = lagged(moving, np.exp(-1 / np.array(lags)), at)
-            parts += [values.real, values.imag] if np.iscomplexobj(values) else [values]
-        return np.hstack([*parts, self.started(v[0], at), np.ones((len(at), 1))])
+        filters = self.filtered(v, at)
+        return np.hstack([v[at, :-1], self.steps(v, at), *filters, self.started(v[0], at), np.ones((len(at), 1))])
+
+    def steps(self, v: Array, at: Whole) -> Array:
+        """Return the changes from sample to sample before samples `at`, the last one first."""
+        changes = np.concatenate([np.zeros((self.delays, self.delayed)), np.diff(v[:, : self.delayed], axis=0)])
+        windows = np.lib.stride_tricks.sliding_window_view(changes[::-1].ravel(), (self.delays - 1) * self.delayed)
+        return windows[(len(v) - 1 - at) * self.delayed]
+
+    def filtered(self, v: Array, at: Whole) -> list[Array]:
+        """Return lags and the real and imaginary parts of resonances at samples `at`."""
+        lags, resonances = (
+            lagged(v[:, :-1], np.exp(-1 / np.array(taus)), at) if taus else np.zeros((len(at), 0))
+            for taus in (self.lags, self.resonances)
+        )
+        return [lags, resonances.real, resonances.imag]
 
     def started(self, first: Array, at: Whole) -> Array:
         """Return the entries of a first sample (channels,), or one for each row, at samples `at`."""
@@ -79,21 +102,20 @@ class Bank:
 
         The signals are then `first` (len(at), channels) at these samples, and before.
         """
-        past, now, age = self.rows(v, begin), self.rows(v, at), (at - begin)[:, None]
-        count, moving, other = len(at), self.channels - 1, (first - v[begin])[:, :-1]
-        filters = np.multiply(moving, [len(self.lags), len(self.resonances), len(self.resonances)])
-        ends = np.cumsum([moving, (self.delays - 1) * self.delayed, *filters])
-        _, _, lags, real, imaginary, _ = np.split(past, ends, axis=1)
-        steps, delay = now[:, ends[0] : ends[1]], np.arange(self.delays - 1)
-        steps = np.where((delay >= age)[..., None], -steps.reshape(count, len(delay), self.delayed), 0.0)
+        count, moving, delay, age = len(at), self.channels - 1, np.arange(self.delays - 1), (at - begin)[:, None]
+        other = (first - v[begin])[:, :-1]
+        steps = np.where((delay >= age)[..., None], -self.steps(v, at).reshape(count, len(delay), self.delayed), 0.0)
         steps -= (delay == age - 1)[..., None] * other[:, None, : self.delayed]
-        parts = [np.where(age == 0, other, 0.0), steps.reshape(count, -1)]
-        for tau, filtered in ((self.lags, lags), (self.resonances, real + 1j * imaginary)):
-            gone = np.exp(-age / np.array(tau))[..., None]
-            change = (gone * (first[:, None, :-1] - filtered.reshape(count, len(tau), moving))).reshape(count, -1)
-            parts += [change.real, change.imag] if np.iscomplexobj(change) else [change]
+        lags, real, imaginary = self.filtered(v, begin)
+        changes = []
+        for taus, past in ((self.lags, lags), (self.resonances, real + 1j * imaginary)):
+            gone = np.exp(-age / np.array(taus))[..., None]
+            changes.append((gone * (first[:, None, :-1] - past.reshape(count, len(taus), moving))).reshape(count, -1))
+        values, constant = np.where(age == 0, other, 0.0), np.zeros((count, 1))
         starts = self.started(first, age[:, 0]) - self.started(v[0], at)
-        return np.hstack([*parts, starts, np.zeros((count, 1))])
+        return np.hstack(
+            [values, steps.reshape(count, -1), changes[0], changes[1].real, changes[1].imag, starts, constant]
+        )
 
     def sizes(self, rms: Array) -> Array:
         """Return the sizes of entries, their RMS; for the start of its decay by the channel's: many start at rest."""
@@ -104,7 +126,7 @@ class Bank:
     def trust(self, nonlinear: float) -> Array:
         """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
         channel = self.channel
-        return np.where((channel >= self.linear) & (channel < self.channels - 1), nonlinear, 0.0)
+        return np.where(channel >= self.linear, nonlinear, 0.0)
 
     @property
     def first(self) -> slice:

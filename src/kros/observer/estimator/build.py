@@ -175,8 +175,8 @@ def best_family(
 
     plain = [design(family) for family in FAMILIES[:-1]]
     without = Design.of(plain[0].channels.without_measurements(), recordings, settings, poles)
-    *readouts, blind = Readout.of([*plain, without])
-    families = dict(zip(FAMILIES, readouts, strict=False))
+    (blind,) = Readout.of([without])
+    families = dict(zip(FAMILIES, Readout.of(plain), strict=False))
 
     def better(family: str, other: str) -> str:
         one, before = (families[name].by_fold(hidden) for name in (other, family))

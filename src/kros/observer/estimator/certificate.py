@@ -99,9 +99,8 @@ def outside_percent(readout: Readout, modelled: Lifting) -> Array:
     known = {*own.states, *_signals(modelled, own.inputs), CONSTANT}
     texts = [*own.states, *_signals(own, own.inputs)]
     outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
-    rows, weight = readout.sample
-    added = rows[:, outside] @ readout.coefficients[outside]
-    return 100 * np.sqrt(weight @ added**2) / design.recordings.size
+    added = readout.sample[:, outside] @ readout.coefficients[outside]
+    return 100 * np.linalg.norm(added, axis=0) / design.recordings.size
 
 
 def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCertificate:

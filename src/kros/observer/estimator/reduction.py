@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import EPS, Array, frozen
-from ...core.linalg import balanced_size, qr_triangle
+from ...core.linalg import balanced_size
 from ...core.norms import gramian_root
 from ...loops import recursion
 from .channels import Channels
@@ -84,8 +84,7 @@ def reduced(readout: Readout, order: int | None = None, coefficients: Array | No
     errors[list(design.channels.measured)] *= design.settings.measured_loss
     errors = np.tile(errors, coefficients.shape[1] // len(errors))
     A, B, S = design.bank.system()
-    X, w = readout.sample
-    size = np.sqrt(w @ (X * X))
+    size = np.linalg.norm(readout.sample, axis=0)
     size = np.where(size > 0, size, 1.0)
     A, B, S = A * size / size[:, None], B / size[:, None], S / size[:, None]
     C = coefficients.T * size @ A
@@ -95,7 +94,7 @@ def reduced(readout: Readout, order: int | None = None, coefficients: Array | No
     _, values, U = np.linalg.svd(root, full_matrices=False)
     kept = values > EPS * values[0]
     L, inverse = values[kept, None] * U[kept], U[kept].T / values[kept]
-    _, sigma, V = np.linalg.svd(qr_triangle((X / size * np.sqrt(w)[:, None]) @ L.T))
+    _, sigma, V = np.linalg.svd(readout.sample / size @ L.T, full_matrices=False)
     scale = np.maximum(sigma, EPS * sigma[:1])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
     whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)

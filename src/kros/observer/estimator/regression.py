@@ -17,7 +17,7 @@ import numpy as np
 
 from ...core import EPS, ROUNDING, AnyArray, Array, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
-from .rows import Design, Group, Recordings, in_step
+from .rows import Design, Group, Recordings, Sample
 
 Candidate = tuple[float, float, float]  # penalty, and weights of starts elsewhere and of restarts
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
@@ -27,7 +27,7 @@ _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
 class Whitening:
     """Principal directions of the bank."""
 
-    sample: tuple[Array, Array]  # thinned rows, from which they are found, with their weights
+    sample: Array  # triangle of thinned rows, from which they are found
     directions: Array  # (p, r)
     penalty: Array  # (r,), 1 / sigma^2
     trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
@@ -35,33 +35,18 @@ class Whitening:
     elsewhere: Array  # (r, r), the same of a start at another place
 
     @classmethod
-    def of(cls, design: Design) -> Whitening:
+    def of(cls, design: Design, sample: Sample) -> Whitening:
         """Find the directions from thinned rows, and what rows with errors of weights add."""
-        X, weights = sample = design.sample()
         bank, settings = design.bank, design.settings
-        size = bank.sizes(np.sqrt(weights @ (X * X)))
-        scale = np.sqrt(weights)[:, None] / size
-        restarts, others, errors = design.errors(X)
-        disturbed, elsewhere = sparse_triangle(restarts * scale), sparse_triangle(others * scale)
-        wrong = [np.sqrt(share) * sparse_triangle(one * scale) for share, one in errors]
-        trust = np.vstack([np.diag(bank.trust(settings.nonlinear_trust)), *wrong])
+        size = bank.sizes(np.linalg.norm(sample.rows, axis=0))
+        disturbed, elsewhere = sample.restarts / size, sample.elsewhere / size
+        trust = np.vstack([np.diag(bank.trust(settings.nonlinear_trust)), sample.errors / size])
         starts = np.sqrt(settings.settled_share) * disturbed, np.sqrt(settings.start_share) * elsewhere
-        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust, *starts])))
+        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([sample.rows / size, trust, *starts])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
-        directions = V[:count].T / sigma[:count] / size[:, None]
-        moments = (
-            rows.T @ rows for rows in (each @ (directions * size[:, None]) for each in (trust, disturbed, elsewhere))
-        )
-        return cls(sample, directions, sigma[:count] ** -2.0, *moments)
-
-
-def sparse_triangle(rows: Array) -> Array:
-    """Return the triangle of a QR decomposition of rows, many columns of which are zero."""
-    used = rows.any(axis=0)
-    triangle = qr_triangle(rows[:, used])
-    found = np.zeros((len(triangle), rows.shape[1]))
-    found[:, used] = triangle
-    return found
+        directions = V[:count].T / sigma[:count]
+        moments = (rows.T @ rows for rows in (each @ directions for each in (trust, disturbed, elsewhere)))
+        return cls(sample.rows, directions / size[:, None], sigma[:count] ** -2.0, *moments)
 
 
 @frozen
@@ -77,22 +62,27 @@ class Moments:
 
     @classmethod
     def of(cls, designs: Sequence[Design], whitenings: Sequence[Whitening]) -> list[Moments]:
-        """Sum the rows of every group, for every design."""
-        groups, settings = designs[0].groups, designs[0].settings
-        sums: list[dict[Group, Array]] = [{} for _ in designs]
-        for episode in in_step(designs, designs[0].recordings.some(settings.episodes, groups), settings.rows):
-            for total, whitening, (key, rows, targets, weights) in zip(sums, whitenings, episode, strict=True):
-                columns = np.hstack([rows @ whitening.directions, targets, np.ones((len(rows), 1))])
-                columns *= np.sqrt(weights)[:, None]
-                total[groups[key]] = total.get(groups[key], 0.0) + columns.T @ columns
-        moments = []
-        for whitening, total in zip(whitenings, sums, strict=True):
-            r, mean = whitening.directions.shape[1], np.stack([*total.values()])
-            count = mean[:, -1, -1].copy()
-            mean /= count[:, None, None]
-            power = np.diagonal(mean, axis1=1, axis2=2)[:, r:-1]
-            moments.append(cls(whitening, tuple(total), mean[:, :r, :r], mean[:, :r, r:-1], power, count))
-        return moments
+        """Sum the rows of every group, for every design: their banks are parts of that of the last."""
+        last = designs[-1]
+        some, places = last.training(), [last.bank.places(design.bank) for design in designs]
+        groups = tuple(dict.fromkeys(last.groups[key] for key in some.keys))
+        count, power = np.zeros(len(groups)), np.zeros((len(groups), len(last.recordings.size)))
+        sizes = [whitening.directions.shape[1] for whitening in whitenings]
+        gram = [np.zeros((len(groups), r, r)) for r in sizes]
+        cross = [np.zeros((len(groups), r, power.shape[1])) for r in sizes]
+        for key, rows, targets, weights in last.rows(some, last.settings.rows):
+            g, root = groups.index(last.groups[key]), np.sqrt(weights)[:, None]
+            rows, targets = root * rows, root * targets
+            count[g] += weights.sum()
+            power[g] += (targets**2).sum(axis=0)
+            for whitening, entries, squares, products in zip(whitenings, places, gram, cross, strict=True):
+                white = rows[:, entries] @ whitening.directions
+                squares[g] += white.T @ white
+                products[g] += white.T @ targets
+        for sums in (power, *gram, *cross):
+            sums /= count.reshape(-1, *[1] * (sums.ndim - 1))
+        parts = zip(whitenings, gram, cross, strict=True)
+        return [cls(whitening, groups, G, C, power, count) for whitening, G, C in parts]
 
     def of_groups(self, what: str) -> AnyArray:
         """Return fold, condition or part of every group."""
@@ -149,7 +139,7 @@ class Readout:
     """Coefficients of all states on a bank, in the channels' units, with errors on units and episodes left out."""
 
     design: Design
-    sample: tuple[Array, Array]  # thinned rows of the bank, with their weights
+    sample: Array  # triangle of thinned rows of the bank
     coefficients: Array  # (p, n)
     careful: Array  # (p, n), for the time after a start or a loss
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
@@ -160,10 +150,11 @@ class Readout:
 
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Readout]:
-        """Fit all states by every design, in two passes over the recordings."""
-        return [
-            cls._fitted(*each) for each in zip(designs, Moments.of(designs, [*map(Whitening.of, designs)]), strict=True)
-        ]
+        """Fit all states by every design, in two passes over the recordings; the last bank holds the others."""
+        last = designs[-1]
+        sample = last.sample()
+        whitenings = [Whitening.of(design, sample.of(last.bank.places(design.bank))) for design in designs]
+        return [cls._fitted(*each) for each in zip(designs, Moments.of(designs, whitenings), strict=True)]
 
     @classmethod
     def _fitted(cls, design: Design, moments: Moments) -> Readout:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import compress
 from typing import TypeVar
 
 import numpy as np
 
 from ...core import Array, DataError, Whole, frozen
+from ...core.linalg import qr_triangle
 from ...data import EpisodeBatch, EpisodeKey
 from .bank import Bank
 from .channels import Channels
@@ -138,6 +139,43 @@ def spread(items: Sequence[T], count: int) -> list[T]:
 
 
 @frozen
+class Sample:
+    """Moments of thinned rows of a bank, as triangles R (., p): a mean over rows is the sum of squares of R's."""
+
+    rows: Array
+    restarts: Array  # what a start in the middle of an episode changes
+    elsewhere: Array  # what a first sample at another place changes
+    errors: Array  # what errors of measurements change, with their weights
+
+    def of(self, columns: Whole) -> Sample:
+        """Return the moments of some entries."""
+        return Sample(*(triangle[:, columns] for triangle in (self.rows, self.restarts, self.elsewhere, self.errors)))
+
+
+class Triangles:
+    """Triangles of QR decompositions of rows (., p) that come in pieces, by their names."""
+
+    def __init__(self, columns: int) -> None:
+        self._columns, self._pieces = columns, dict[str, list[Array]]()
+
+    def add(self, name: str, rows: Array) -> None:
+        """Add rows; as soon as they are many, their triangle takes their place."""
+        pieces = self._pieces.setdefault(name, [])
+        pieces.append(rows)
+        if sum(map(len, pieces)) > 3 * self._columns:
+            pieces[:] = [self.of(name)]
+
+    def of(self, name: str) -> Array:
+        """Return the triangle of the rows so far; many columns may be zero."""
+        rows = np.vstack([np.zeros((1, self._columns)), *self._pieces.get(name, [])])
+        used = rows.any(axis=0)
+        part = qr_triangle(rows[:, used])
+        triangle = np.zeros((len(part), self._columns))
+        triangle[:, used] = part
+        return triangle
+
+
+@frozen
 class Design:
     """A bank of channels with the recordings that it is fitted to: the rows of the regression."""
 
@@ -174,34 +212,39 @@ class Design:
             targets[:, measured] -= reference / recordings.size[measured]
             yield key, self.seen(v, at), targets, weights
 
-    def sample(self) -> tuple[Array, Array]:
-        """Return thinned rows of the bank of some episodes, and weights that sum to one."""
-        settings = self.settings
-        found = list(self.rows(self.recordings.some(settings.sample_episodes), settings.sample))
-        weight = np.concatenate([weights for *_, weights in found])
-        return np.vstack([rows for _, rows, *_ in found]), weight / weight.sum()
+    def training(self) -> Recordings:
+        """Return the episodes of the regression."""
+        return self.recordings.some(self.settings.episodes, self.groups)
 
-    def errors(self, rows: Array) -> tuple[Array, Array, list[tuple[float, Array]]]:
-        """Return what rows of `sample` change by with later starts, with one elsewhere, and by others with weights."""
-        settings, bias, rng = self.settings, self.recordings.bias, np.random.default_rng(self.settings.seed)
-        biased, bridged, restarts, elsewhere = (list[Array]() for _ in range(4))
-        for _, batch, at, _ in self.episodes(self.recordings.some(settings.sample_episodes), settings.sample):
+    def sample(self) -> Sample:
+        """Return the moments of thinned rows of some episodes, and of what errors of measurements change them by."""
+        settings, bias, bank, rng = (
+            self.settings,
+            self.recordings.bias,
+            self.bank,
+            np.random.default_rng(self.settings.seed),
+        )
+        triangles, weight = Triangles(len(bank)), 0.0
+        for _, batch, at, weights in self.episodes(self.recordings.some(settings.sample_episodes), settings.sample):
             y = self.measurements(batch)
             v = self.signals(batch, y)
             begin = (rng.random(len(at)) * (len(v) - 1 - at)).astype(int)
             signals, first = self.channels.filtered(v), self.channels.filtered(v[None, begin])[0]
-            restarts.append(self.bank.restarted(signals, first, begin, begin + at))
-            elsewhere.append(np.zeros_like(restarts[-1]))
-            elsewhere[-1][:, self.bank.first] = self.bank.started(first - signals[0], at)
+            rows, root = bank.rows(signals, at), np.sqrt(weights)[:, None]
+            elsewhere = np.zeros_like(rows)
+            elsewhere[:, bank.first] = bank.started(first - signals[0], at)
+            triangles.add("rows", root * rows)
+            triangles.add("restarts", root * bank.restarted(signals, first, begin, begin + at))
+            triangles.add("elsewhere", root * elsewhere)
             if not self.channels.inputs_only:
                 lost = np.random.default_rng(settings.seed).random(len(y)) < 0.5
                 line = interpolated(np.where(lost[:, None], np.nan, y))
-                bridged.append(self.seen(self.signals(batch, line), at))
+                bridged = self.seen(self.signals(batch, line), at) - rows
+                triangles.add("errors", np.sqrt(settings.gap_share) * root * bridged)
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
-                biased.append(self.seen(self.signals(batch, y + bias), at))
-        wrong = [(settings.gap_share, bridged), (1.0, biased)]
-        others = [(share, np.vstack(parts) - rows) for share, parts in wrong if parts]
-        return np.vstack(restarts), np.vstack(elsewhere), others
+                triangles.add("errors", root * (self.seen(self.signals(batch, y + bias), at) - rows))
+            weight += weights.sum()
+        return Sample(*(triangles.of(name) / np.sqrt(weight) for name in ("rows", "restarts", "elsewhere", "errors")))
 
     def measurements(self, batch: EpisodeBatch) -> Array:
         """Return the measurements of an episode, (n_samples, q), with straight lines over missing ones."""
@@ -229,9 +272,3 @@ class Design:
         keys, folds, parts = self.recordings.keys, self.settings.folds, self.settings.parts
         names, units = sorted({k.episode for k in keys}), list(dict.fromkeys(k.unit for k in keys))
         return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
-
-
-def in_step(designs: Sequence[Design], recordings: Recordings, rows: int) -> Iterator[tuple[Rows, ...]]:
-    """Yield what `Design.rows` yields of several designs, episode by episode: each is read once."""
-    once = replace(recordings, read=lru_cache(maxsize=1)(recordings.read))
-    return zip(*(design.rows(once, rows) for design in designs), strict=True)

@@ -91,14 +91,15 @@ def identify_estimator(
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
         return assembled(name, lifting, inputs, readout.design, (filters, fallback), sample_period_s, parameters or {})
 
-    def filters_of(one: Readout, other: Readout) -> tuple[Filters, Filters]:
+    def filters_of(one: Readout, other: Readout, orders: Sequence[int | None]) -> tuple[Filters, Filters]:
         both = np.hstack([one.coefficients, one.careful])
-        return reduced(one, settings.order, both), reduced(other, settings.order)
+        return reduced(one, orders[0], both), reduced(other, orders[1])
 
-    filters, fallback = filters_of(readout, blind)
+    filters, fallback = filters_of(readout, blind, [settings.order] * 2)
     observer = observer_of(filters, fallback)
     group, unseen = readout.left_out_group()
-    trial = observer_of(*filters_of(readout.without(group), blind.without(group)))
+    orders = len(filters.A), len(fallback.A)
+    trial = observer_of(*filters_of(readout.without(group), blind.without(group), orders))
 
     F = decay_of(observer, recordings, settings, held)
     observer, trial = (replace(let_go(one, F), runtime=bounded(one, recordings, settings)) for one in (observer, trial))

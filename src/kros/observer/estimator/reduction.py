@@ -101,12 +101,13 @@ def reduced(readout: Readout, order: int | None = None, coefficients: Array | No
     if order is not None:
         return whole.first(order).modal()
     signals = design.sample_signals(_EPISODES, round(10 * max([*design.bank.lags, design.bank.delays])))
-    every, most = np.arange(len(signals)), 2 * design.settings.loss
-    wanted = np.stack([design.bank.rows(v, every) @ coefficients for v in signals.swapaxes(0, 1)], axis=1)
+    at, weights = design.thinned([len(signals)], design.settings.sample // _EPISODES)[0]
+    wanted = np.stack([design.bank.rows(v, at) @ coefficients for v in signals.swapaxes(0, 1)], axis=1)
+    most = 2 * design.settings.loss
 
     def enough(order: int) -> bool:
-        missed = (whole.first(order).along(signals) - wanted)[..., used] / errors[used]
-        return bool(np.mean(missed**2, axis=(0, 1)).max() <= most)
+        missed = (whole.first(order).along(signals)[at] - wanted)[..., used] / errors[used]
+        return bool((weights @ np.mean(missed**2, axis=1)).max() <= most * weights.sum())
 
     # of errors that grow as little as asked, the least order
     bound = next((n for n in (2**i for i in range(len(sigma).bit_length())) if enough(n)), len(sigma))

@@ -193,9 +193,13 @@ class Design:
 
     def episodes(self, recordings: Recordings, rows: int) -> Iterator[tuple[EpisodeKey, EpisodeBatch, Whole, Array]]:
         """Yield every episode with the samples that are rows, and their weights."""
-        first = round(self.settings.start_rows * max(self.settings.start, default=0.0))
-        for key, (at, weights) in zip(recordings.keys, thinned(recordings.lengths, rows, first), strict=True):
+        for key, (at, weights) in zip(recordings.keys, self.thinned(recordings.lengths, rows), strict=True):
             yield key, recordings.read(key), at, weights
+
+    def thinned(self, lengths: Sequence[int], rows: int) -> list[tuple[Whole, Array]]:
+        """Return which samples of episodes are about so many rows, and for how many each stands, see `thinned`."""
+        first = round(self.settings.start_rows * max(self.settings.start, default=0.0))
+        return list(thinned(lengths, rows, first))
 
     def rows(self, recordings: Recordings, rows: int) -> Iterator[Rows]:
         """Yield episode, bank rows, targets and weights of every episode.

@@ -27,7 +27,7 @@ import numpy as np
 import kros
 from kros.core.artifacts import read_json, write_json
 from kros.data import EpisodeBatch, Population, split_episodes
-from kros.design.validation import TrainingSet
+from kros.design.training import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import EstimatorSettings, Recordings, identify_estimator, run_observer
 from kros.study import Stage, load_config

@@ -46,7 +46,7 @@ from kros.data import EpisodeBatch, EpisodeKey, Population, from_arrays, split_e
 from kros.design.baselines import make_learned  # noqa: E402
 from kros.design.settings import ObserverSettings, SynthesisSettings  # noqa: E402
 from kros.design.synthesize import Designs, synthesize_all  # noqa: E402
-from kros.design.validation import TrainingSet  # noqa: E402
+from kros.design.training import TrainingSet  # noqa: E402
 from kros.evaluate.errors import true_errors  # noqa: E402
 from kros.evaluate.sensor import as_shown  # noqa: E402
 from kros.identify.calibration import segments_of  # noqa: E402

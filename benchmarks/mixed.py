@@ -30,7 +30,7 @@ from kros.design.methods.gains import OpenLoop
 from kros.design.methods.robust import Mixed
 from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
-from kros.design.validation import percent_of
+from kros.design.training import percent_of
 from kros.plants import HarmonicDrivePopulation
 from kros.study import validate_config
 from kros.study.config import Stage

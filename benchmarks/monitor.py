@@ -25,7 +25,7 @@ from scipy.stats import beta, chi2
 import kros
 from kros.data import EpisodeBatch, Unit
 from kros.design.monitor import MonitorSettings, fit_monitor
-from kros.design.validation import TrainingSet
+from kros.design.training import TrainingSet
 from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
 from kros.observer.simulate import run_innovations

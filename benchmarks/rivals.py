@@ -22,7 +22,7 @@ import numpy as np
 import kros
 from kros.data import EpisodeBatch, Population, split_episodes
 from kros.design.baselines import make_learned
-from kros.design.validation import TrainingSet
+from kros.design.training import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import EstimatorSettings, Recordings, identify_estimator, run_observer
 from kros.observer.baselines.trained import Rows

@@ -23,7 +23,7 @@ from kros.data import EpisodeBatch, write_parquet
 from kros.design.baselines import make_learned
 from kros.design.methods import methods_of
 from kros.design.synthesize import tasks_of
-from kros.design.validation import TrainingSet
+from kros.design.training import TrainingSet
 from kros.evaluate import error_percent
 from kros.evaluate.sensor import as_shown
 from kros.identify.calibration import segments_of

@@ -23,7 +23,7 @@ import kros
 from kros.core.artifacts import load_artifact
 from kros.data import EpisodeBatch, Population, read, split_episodes
 from kros.design.baselines import make_difference, make_extended, make_learned
-from kros.design.validation import TrainingSet
+from kros.design.training import TrainingSet
 from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
 from kros.lifting import Lifting

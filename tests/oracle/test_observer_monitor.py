@@ -9,7 +9,7 @@ from machines import DT, LIMITS, drive, filters, samples, watched
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
 from kros.design.monitor import MonitorSettings, bound_of_peaks, fit_monitor
-from kros.design.validation import TrainingSet
+from kros.design.training import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Observer, SampleStatus
 from kros.observer.monitor import RECOVERY, Monitor, Watch, octaves

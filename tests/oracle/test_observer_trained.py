@@ -6,7 +6,7 @@ import pytest
 import kros
 from kros.data import EpisodeBatch
 from kros.design.baselines import make_trained
-from kros.design.validation import TrainingSet
+from kros.design.training import TrainingSet
 from kros.observer.baselines.trained import Features
 
 

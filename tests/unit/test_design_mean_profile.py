@@ -8,7 +8,7 @@ from kros.core.errors import DataError
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey, Population
 from kros.design.baselines import make_mean_profile
-from kros.design.validation import TrainingSet
+from kros.design.training import TrainingSet
 
 N = 60
 RNG = np.random.default_rng(0)

@@ -18,7 +18,7 @@ from ..observer.baselines.extended_kalman import ExtendedKalman, start_covarianc
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.baselines.trained import Regressor, Rows
 from .task import Label
-from .validation import TrainingSet, rank
+from .training import TrainingSet, rank
 
 
 @frozen

@@ -34,7 +34,7 @@ from ..synthesis.worst_case.certificate import attained, certify_errors
 from ..uncertainty import UncertainModel
 from .monitor import settling
 from .task import Design, DesignTask
-from .validation import TRAINING, hidden_mean, percent_of
+from .training import TRAINING, hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
 

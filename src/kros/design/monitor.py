@@ -21,7 +21,7 @@ from ..core.linalg import spectral_radius
 from ..observer import Observer, run_innovations, spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
-from .validation import TrainingSet
+from .training import TrainingSet
 
 log = logging.getLogger(__name__)
 Group = tuple[str, str]  # unit and condition

@@ -28,7 +28,7 @@ from .methods import METHODS, methods_of, preferred, suitable
 from .monitor import fit_monitor
 from .settings import ObserverSettings, SynthesisSettings
 from .task import Design, DesignTask, Method, split_name
-from .validation import TrainingSet
+from .training import TrainingSet
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from ..data import Shown
 from ..identify import ModelSet
 from ..observer import Observer, ReliftCertificate, Runtime, Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
-from .validation import TrainingSet, percent_of, rank
+from .training import TrainingSet, percent_of, rank
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class DesignTask:
         return Synthesis("open_loop", gain(nothing, self.models.sample_period_s), Status.OPTIMAL, Injection.STATE)
 
     def best(self, observers: Sequence[Observer]) -> tuple[int, float]:
-        """Return which observer ranks first on training episodes (`validation.rank`), and its error to open loop."""
+        """Return which observer ranks first on training episodes (`training.rank`), and its error to open loop."""
         limit, *errors = percent_of([self.observer(self.open_loop()), *observers], self.training.read())
         ranks = [rank(error, limit, self.models.measured) for error in errors]
         return ranks.index(min(ranks)), min(ranks)[1]

@@ -25,7 +25,7 @@ from ...observer.residual import (
 from ...synthesis import Synthesis, kalman
 from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
 from ..task import Design, DesignTask, Label, Method
-from ..validation import hidden_mean, percent_of
+from ..training import hidden_mean, percent_of
 
 
 @frozen

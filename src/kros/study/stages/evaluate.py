@@ -14,7 +14,7 @@ from ...core import AnyArray, Array, KrosError, Names, Record, save_artifact
 from ...data import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
-from ...design.validation import TrainingSet
+from ...design.training import TrainingSet
 from ...evaluate.held_out import HeldOut, Outcome, alike
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...core import Array, ConfigError, KrosError, Record, frozen, load_artifact, save_artifact
 from ...data import EpisodeBatch, Population, some
-from ...design.validation import seen_by
+from ...design.training import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
 from ...motor_drive import AngleLoad

@@ -8,7 +8,7 @@ from batches import batch_of
 
 from kros.core.errors import DataError
 from kros.lifting import Lifting
-from kros.observer import Observer, run_observer
+from kros.observer import Observer, Runtime, run_observer
 from kros.observer.baselines.difference import FilteredDifference
 from kros.observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from kros.observer.baselines.learned import Moments, Ridge
@@ -60,7 +60,7 @@ def test_extended_filter_of_late_measurements_is_that_of_punctual_ones_predicted
     y, u, phase = rng.normal(size=(30, 1, 1)), rng.normal(size=(30, 1, 2)), {"phase": np.array([0.4])}
     punctual = ExtendedKalman(KOOPMAN, A, B, (0,), Q, R, P0)
     arrives = np.concatenate([np.repeat(y[:1], d, axis=0), y[:-d]])
-    found = replace(punctual, delay=d).run(arrives, u, phase)[:, 0]
+    found = replace(punctual, runtime=Runtime(d)).run(arrives, u, phase)[:, 0]
     before = punctual.run(y, u, phase)[:, 0]
     for k in range(30):
         x = before[max(k - d, 0)]

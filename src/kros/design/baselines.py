@@ -12,7 +12,7 @@ from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, S
 from ..data import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
-from ..observer import Screen, Seen, delay_of, like_measurement_noise, one_step_covariance, one_step_residual
+from ..observer import Screen, Seen, like_measurement_noise, one_step_covariance, one_step_residual
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from ..observer.baselines.learned import Moments, Ridge
@@ -86,8 +86,7 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
         models.parameters_of(unit),
-        delay_of(training.sensor),
-        training.start,
+        training.runtime,
     )
     short = batch.head(DEFAULT.extended_samples)
     estimates = filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)

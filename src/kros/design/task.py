@@ -13,7 +13,7 @@ import numpy as np
 from ..core import Array, ByName, Names, Record, SynthesisError, frozen, gain, load_artifact, loader, save_artifact
 from ..data import Shown
 from ..identify import ModelSet
-from ..observer import Observer, ReliftCertificate, Runtime, Sensors, delay_of
+from ..observer import Observer, ReliftCertificate, Sensors
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .training import TrainingSet, percent_of, rank
 
@@ -148,7 +148,7 @@ class DesignTask:
             injection=synthesis.injection,
             sample_period_s=models.sample_period_s,
             parameters=models.parameters_of(self.unit),
-            runtime=self.runtime,
+            runtime=self.training.runtime,
             seen=self.training.seen,
             sensor=self.sensor,
         )
@@ -161,11 +161,6 @@ class DesignTask:
     def sensor(self) -> Sensors:
         """What is declared of the sensors of measured states, by name, in the task's channels."""
         return self.training.sensor
-
-    @property
-    def runtime(self) -> Runtime:
-        """What observers have to know of the machine: the delay of measurements, and where hidden states start."""
-        return Runtime(delay_of(self.sensor), start=self.training.start)
 
     @property
     def selector(self) -> Array:

@@ -16,7 +16,7 @@ from ..evaluate.errors import error_rms, largest
 from ..evaluate.held_out import observers_run
 from ..evaluate.sensor import as_shown
 from ..identify import IdentifiedModels, ModelSet
-from ..observer import Observer, Seen, spread
+from ..observer import Observer, Runtime, Seen, delay_of, spread
 from ..observer.sensor import Sensors, in_units
 
 
@@ -70,6 +70,11 @@ class TrainingSet:
         seen = None if self.seen is None else Seen(self.seen.measured / outputs, self.seen.inputs / inputs)
         population, sensor = scale_population(self.population, models.sizes), in_units(self.sensor, models.sizes)
         return replace(self, population=population, seen=seen, sensor=sensor)
+
+    @property
+    def runtime(self) -> Runtime:
+        """What observers have to know of the machine: the delay of measurements, and where hidden states start."""
+        return Runtime(delay_of(self.sensor), start=self.start)
 
     @cached_property
     def start(self) -> Array | None:

@@ -201,12 +201,10 @@ class ObserverData:
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
     def initial(self, y: ArrayLike, parameters: Parameters | None = None, u: ArrayLike | None = None) -> Array:
-        """Return the first estimate, (..., n): measurements, and others as declared, zero or as a bank starts."""
+        """Return the first estimate, (..., n): measurements, and others as `runtime.first` or as a bank starts."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
-        x = np.zeros((*y.shape[:-1], self.lifting.n_states))
-        if self.runtime.start is not None:
-            x[:] = self.runtime.start
+        x = np.tile(self.runtime.first(self.lifting.n_states), (*y.shape[:-1], 1))
         x[..., list(self.measured)] = y
         if self.bank is not None:
             inputs = np.broadcast_to(0.0 if u is None else u, (*y.shape[:-1], len(self.inputs)))

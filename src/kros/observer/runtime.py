@@ -85,6 +85,10 @@ class Runtime:
         """Return what there is of every state, by name."""
         return {name: values for name, values in vars(self).items() if name != "delay" and values is not None}
 
+    def first(self, n: int) -> Array:
+        """Return the first estimate of n states before any measurement."""
+        return np.zeros(n) if self.start is None else self.start
+
     def limits(self) -> dict[str, Array]:
         """Return the limits that there are, by name."""
         return {name: values for name, values in self.by_state().items() if name != "start"}

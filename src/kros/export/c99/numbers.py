@@ -120,7 +120,7 @@ class Source:
             "functions": len(lifting.functions),
             "order": o.controller.n_states,
             "delay": o.runtime.delay,
-            "start": np.zeros(lifting.n_states) if o.runtime.start is None else o.runtime.start,
+            "start": o.runtime.first(lifting.n_states),
             "history": len(lifting.window.earlier),
             "guard": np.clip([low, high], -self.precision.largest, self.precision.largest),
             "bounds": self.bounds(),

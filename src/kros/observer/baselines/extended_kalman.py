@@ -23,6 +23,7 @@ import numpy as np
 
 from ...core import Array, Columns, DimensionError, Parameters, frozen
 from ...lifting import Lifting
+from ..runtime import Runtime
 
 
 @frozen
@@ -37,8 +38,7 @@ class ExtendedKalman:
     R: Array  # (q, q), measurement noise
     P0: Array  # (n, n), of the first estimate
     parameters: Mapping[str, float] = field(default_factory=dict)
-    delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
-    start: Array | None = None  # (n,), first estimate of states that are not measured; zero by default
+    runtime: Runtime = field(default_factory=Runtime)  # its delay and start; limits are not used
 
     def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Predict a batch from y (n_samples, batch, q), NaN where missing, and u, shape (n_samples, batch, n)."""
@@ -49,12 +49,10 @@ class ExtendedKalman:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
         lifting, n, C, (n_samples, batch) = self.lifting, self.lifting.n_states, list(self.measured), y.shape[:2]
         values = {**self.parameters, **(parameters or {})}
-        if self.delay:
+        if self.runtime.delay:
             return self._late(y, u, values)
         Q = self.Q.reshape(-1, 1, n, n)
-        x, P = np.zeros((len(Q), batch, n)), np.broadcast_to(self.P0, (len(Q), batch, n, n))
-        if self.start is not None:
-            x[:] = self.start
+        x, P = np.tile(self.runtime.first(n), (len(Q), batch, 1)), np.broadcast_to(self.P0, (len(Q), batch, n, n))
         x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
         u = np.broadcast_to(u[:, None], (n_samples, len(Q), *u.shape[1:]))
         estimates, earlier = np.empty((n_samples, *x.shape)), None
@@ -85,13 +83,13 @@ class ExtendedKalman:
 
     def _late(self, y: Array, u: Array, values: Parameters) -> Array:
         """Run on what was measured, and predict each estimate to the row in which it is there."""
-        d = min(self.delay, len(y) - 1)
+        d = min(self.runtime.delay, len(y) - 1)
         if self.lifting.history:
             raise DimensionError(
                 f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found "
                 f"{self.lifting.functions}."
             )
-        x = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], values)
+        x = replace(self, runtime=replace(self.runtime, delay=0)).run_all(y[d:], u[: len(u) - d], values)
         late = np.empty((len(x), len(y), *x.shape[2:]))
         for step in range(d):
             late[:, step] = x[:, 0]  # nothing arrived but where to start

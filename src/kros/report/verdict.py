@@ -239,7 +239,7 @@ def _of_certificates(facts: Facts) -> Checks:
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
     bound = facts.get("uncertainty").get(facts.model, {}).get("weight", {}).get("cover_max")
     if bound is not None and bound > 1:
-        action = "Use kros.quantify(models, max_order=6) in Python."
+        action = "Use kros.quantify with a larger max_order in Python."
         yield "The weights do not bound all units that they were fitted to.", action, "uncertainty"
     for fold, why in facts.get("left_out").get("failed", {}).items():
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"

@@ -42,7 +42,7 @@ BASELINES = {
 }
 
 
-class Estimator(Protocol):
+class BaselineEstimator(Protocol):
     """What can be run over a batch of episodes."""
 
     def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
@@ -53,7 +53,7 @@ class Estimator(Protocol):
 class Baseline:
     """A baseline that was tuned or trained."""
 
-    by_unit: Mapping[str, Estimator]
+    by_unit: Mapping[str, BaselineEstimator]
     measured: Columns
     estimated: Columns
     facts: Record

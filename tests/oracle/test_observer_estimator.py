@@ -21,7 +21,7 @@ from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.gaps import decay
 from kros.observer.estimator.reduction import Filters, reduced
-from kros.observer.estimator.regression import Moments, Readout, Whitening
+from kros.observer.estimator.regression import Moments, Readout, Whitening, condition_weights
 from kros.observer.estimator.rows import Design, interpolated
 from kros.observer.simulate import Course
 
@@ -191,6 +191,22 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
         rtol=1e-4,
         atol=1e-6 * np.abs(coefficients).max(),
     )
+
+
+def test_left_out_errors_are_those_of_penalties_that_other_units_chose():
+    recordings, _ = plant(units=4, episodes=2, spread=0.6)
+    made = design(recordings, settings=FEW.model_copy(update={"parts": 1, "rows": 1000, "sample": 1000}))
+    (readout,), (moments,) = Readout.of([made]), Moments.of([made], [Whitening.of(made, made.sample())])
+    settings, weights = made.settings, condition_weights(moments)
+    candidates = [(penalty, 0.0, settings.settled_share) for penalty in settings.penalties]
+    others, folds = moments.without(weights, candidates), moments.of_groups("fold")
+    errors = np.array([[moments.errors(c)[i] for c in others[g]] for i, g in enumerate(moments.groups)])
+    differing = 0
+    for i, fold in enumerate(folds):
+        choice = np.log(errors[folds != fold]).mean(axis=0).argmin(axis=0)
+        np.testing.assert_allclose(readout.left_out[i], errors[i, choice, range(3)], rtol=1e-6)
+        differing += (choice != np.log(errors).mean(axis=0).argmin(axis=0)).any()
+    assert differing
 
 
 def test_a_start_without_time_constants_of_its_own_is_that_of_the_lags(exact):
@@ -443,9 +459,9 @@ def test_candidates_are_compared_without_groups_in_which_a_state_rests():
     errors[:, 2:] = 0.1  # the other penalty is no better
     errors[parts < 2, 2:, 0] = -60.0  # but where the first state is zero
     resting = replace(moments, power=np.where((parts < 2)[:, None] & (np.arange(3) == 0), 0.0, 1.0))
-    np.testing.assert_array_equal(resting.best(errors), [[0, 0, 0], [1, 1, 1]])
+    np.testing.assert_array_equal(resting.best(np.exp(errors)), [[0, 0, 0], [1, 1, 1]])
     errors[:, 2:] = -0.3
-    np.testing.assert_array_equal(resting.best(errors), [[2, 2, 2], [3, 3, 3]])
+    np.testing.assert_array_equal(resting.best(np.exp(errors)), [[2, 2, 2], [3, 3, 3]])
 
 
 def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():

@@ -110,14 +110,15 @@ class Moments:
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
-    def best(self, errors: Array) -> Whole:
+    def best(self, errors: Array, among: Flags | None = None) -> Whole:
         """Return the best candidates of every state for each pair of weights, which come in turn, shape (2, n).
 
-        They are best by logarithms of errors (groups, candidates, n) on what is left out.
+        They are best by logarithms of errors (groups, candidates, n) on what is left out, among all groups or some.
         """
+        some = slice(None) if among is None else among
         # A state at zero throughout a group would ask for no estimate of it at all.
-        counted = (self.power > 0)[:, None]
-        mean = errors.mean(axis=0, where=counted | ~counted.any(axis=0))
+        counted = (self.power[some] > 0)[:, None]
+        mean = np.log(errors[some]).mean(axis=0, where=counted | ~counted.any(axis=0))
         return np.stack([2 * mean[i::2].argmin(axis=0) + i for i in range(2)])
 
     def known(self, group: Group) -> Flags:
@@ -165,22 +166,29 @@ class Readout:
         candidates = [(penalty, *pair) for penalty, pair in product(settings.penalties, pairs)]
         others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
-        errors = np.array(left_out)
-        n, (best, careful) = np.arange(errors.shape[2]), moments.best(np.log(errors))
+        errors, folds, states = np.array(left_out), moments.of_groups("fold"), np.arange(moments.power.shape[1])
         every = np.array(list(moments.solved(weights, candidates)))
-        coefficients = every[best, :, n].T
+        best, careful = moments.best(errors)
+        # What is left out took no part in the choice that it is judged with.
+        nested = [moments.best(errors, folds != fold if np.ptp(folds) else None) for fold in folds]
+        coefficients = every[best, :, states].T
+        unaware, careful_unaware = (
+            {
+                g: whitening.directions @ np.array(each)[choice[i], :, states].T
+                for (g, each), choice in zip(others.items(), nested, strict=True)
+            }
+            for i in range(2)
+        )
         return cls(
             design,
             whitening.sample,
             whitening.directions @ coefficients * design.recordings.size,
-            whitening.directions @ every[careful, :, n].T * design.recordings.size,
-            errors[:, best, n],
+            whitening.directions @ every[careful, :, states].T * design.recordings.size,
+            np.array([errors[i, choice[0], states] for i, choice in enumerate(nested)]),
             moments.errors(coefficients),
             np.array(candidates)[best],
-            *(
-                {g: whitening.directions @ np.array(each)[of, :, n].T for g, each in others.items()}
-                for of in (best, careful)
-            ),
+            unaware,
+            careful_unaware,
         )
 
     def left_out_group(self) -> tuple[Group, Recordings]:

@@ -87,7 +87,8 @@ def filters(functions=GEAR, cut=False):
     bank = FilterBank(2, start, *map(np.array, ages))
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((p, 0)), np.zeros((p, 1)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))
-    runtime = Runtime(0, low, high) if cut else Runtime()
+    first = np.append([0.4, 0.1, -0.1], np.zeros(n - 3))
+    runtime = Runtime(0, low, high, first) if cut else Runtime(start=first)
     parts = (lifting, A, B, (0,), ("target", "rate"), none, Injection.STATE, DT, {"phase": 0.3} if functions else {})
     return Observer("filters", *parts, runtime, Seen(np.array([1.5]), np.array([2.0, 9.0])), bank=bank)
 

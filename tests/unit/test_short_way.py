@@ -15,6 +15,7 @@ from kros.design.methods.gains import OpenLoop
 from kros.design.methods.robust import WorstCaseH2
 from kros.identify.presets import lifting_settings, resolve_lifting, resolve_phase
 from kros.identify.settings import CalibrationSettings
+from kros.observer import run_observer
 from kros.plants import PLANTS
 from kros.uncertainty import UncertainModels, quantify
 
@@ -56,19 +57,30 @@ class Refusing(OpenLoop):
         return "it never is"
 
 
-def test_hidden_states_start_where_they_do_in_training(population: Population) -> None:
-    """A current that never is near zero: without it, every model would begin with its full size as an error."""
-    moved = np.array([0.0, 0.0, 100.0, 0.0])
+def test_states_start_where_they_do_in_training(population: Population) -> None:
+    """A position and a current that are never near zero: every model would begin with their full size as an error."""
+    moved = np.array([20.0, 0.0, 100.0, 20.0])
     data = {u: [population.read(key) + moved for key in population.keys(u)] for u in population.unit_ids}
     names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
     other = kros.from_arrays(data, **names, sample_period_s=population.sample_period_s)
     found = kros.quantify(kros.identify(other, refine=False), n_freqs=60, max_order=1)
-    first = np.array([data[key.unit][int(key.episode)][0] for key in found.models.facts.train])[:, 1:3]
+    first = np.array([data[key.unit][int(key.episode)][0] for key in found.models.facts.train])[:, :3]
     mean, error = first.mean(axis=0), first.var(axis=0) / len(first)
     expected = mean * np.maximum(1 - error / mean**2, 0)  # James and Stein
     for method in ("open_loop", "kalman_tuned"):
-        start = kros.synthesize(found, method, methods=()).observer.initial([0.5])
-        np.testing.assert_allclose(start, [0.5, *expected], rtol=1e-9)
+        observer = kros.synthesize(found, method, methods=()).observer
+        np.testing.assert_allclose(observer.initial([0.5]), [0.5, *expected[1:]], rtol=1e-9)
+        np.testing.assert_allclose(observer.initial([np.nan]), expected, rtol=1e-9)
+    few = {"rows": 2000, "sample": 1000, "delays": 10, "gap_samples": 5000}
+    observer = kros.synthesize(found, "estimator", methods=(), estimator=few).observer
+    values = np.concatenate([each for episodes in data.values() for each in episodes])
+    one = next(iter(data.values()))[0]
+    y, u = one[:, None, :1].copy(), one[:, None, 3:]
+    y[:100] = np.nan
+    early = run_observer(observer, y, u)[:100, 0]
+    margin = 0.3 * np.ptp(values, axis=0)[:3]
+    assert (early > values.min(axis=0)[:3] - margin).all()
+    assert (early < values.max(axis=0)[:3] + margin).all()
 
 
 def test_a_method_may_have_other_options(uncertain: UncertainModels) -> None:

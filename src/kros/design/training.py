@@ -73,19 +73,18 @@ class TrainingSet:
 
     @property
     def runtime(self) -> Runtime:
-        """What observers have to know of the machine: the delay of measurements, and where hidden states start."""
+        """What observers have to know of the machine: the delay of measurements, and where states start."""
         return Runtime(delay_of(self.sensor), start=self.start)
 
     @cached_property
     def start(self) -> Array | None:
-        """The mean first state of the episodes, zero where it is measured; None where all of it is zero.
+        """The mean first state of the episodes; None where all of it is zero.
 
         It counts by ``1 - error^2 / mean^2``, if that is positive (James and Stein): little where signs are random.
         """
         values = EpisodeBatch.read(self.population, self.keys, 1).states[0]
         mean, squared_error = values.mean(axis=0), values.var(axis=0) / len(values)
         first = mean * np.maximum(1 - squared_error / np.maximum(mean**2, TINY), 0.0)
-        first[np.isin(self.population.states, self.population.measured)] = 0.0
         return first if first.any() else None
 
     def read(self, most: int | None = TRAINING.samples) -> EpisodeBatch:

@@ -202,10 +202,9 @@ class ObserverData:
 
     def initial(self, y: ArrayLike, parameters: Parameters | None = None, u: ArrayLike | None = None) -> Array:
         """Return the first estimate, (..., n): measurements, and others as `runtime.first` or as a bank starts."""
-        first = np.asarray(y, dtype=float)
-        y = np.where(np.isfinite(first), first, 0.0)
+        y, at = np.asarray(y, dtype=float), list(self.measured)
         x = np.tile(self.runtime.first(self.lifting.n_states), (*y.shape[:-1], 1))
-        x[..., list(self.measured)] = y
+        x[..., at] = np.where(np.isfinite(y), y, x[..., at])
         if self.bank is not None:
             inputs = np.broadcast_to(0.0 if u is None else u, (*y.shape[:-1], len(self.inputs)))
             values = self.values(parameters)

@@ -107,7 +107,7 @@ class RunningObserver:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         first = self._sample(y, np.zeros(len(self.observer.inputs)))
         self._status = SampleStatus(int(first.status[0, 0]))
-        self._fresh = bool(self._screen.enough(np.isfinite(first.y)).all())
+        self._fresh = self.observer.bank is not None or bool(self._screen.enough(np.isfinite(first.y)).all())
         self._course.begin(first)
         if self._watch is not None:
             self._watch.reset()
@@ -156,9 +156,8 @@ class RunningObserver:
         """
         course, watch, bank = self._course, self._watch, self.observer.bank
         sample = self._sample(y, u, course.held)
-        if self._fresh and not (sample.held.since > self._screen.longest).any():  # it was started at this sample
-            starts = sample.starts & (bank is not None)
-            sample = replace(sample, starts=starts, held=replace(sample.held, stale=np.zeros(1, dtype=bool)))
+        if self._fresh:  # it was started at this sample, filter banks without its inputs
+            sample = replace(sample, starts=np.full((1, 1), bank is not None))
         self._fresh = False
         run = stepped(course, sample)
         if course.loop is not None:

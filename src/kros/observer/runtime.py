@@ -52,7 +52,7 @@ class Runtime:
         Limits of the estimates that are given out, state by state. The observer goes on from its estimate without
         them: a model of a machine under control need not be stable with a state that is stuck.
     start : ndarray, shape (n,), optional
-        First estimate of the states that are not measured; zero by default.
+        First estimate of states, of measured ones where their measurement is missing; zero by default.
 
     Raises
     ------

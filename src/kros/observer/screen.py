@@ -14,8 +14,8 @@ nothing that is far from anything possible enters a state, linear or lifted, and
 model misses while it lasts.
 
 Observers start at a measurement, filter banks at all of them. Where none has arrived yet, or no value of some input,
-the estimate is that from rest,
-and the observer starts again at the first sample at which there are both. It does so, too, after an input was held for
+the estimate is that from the mean first state of training with the inputs that are known, and the observer starts again
+at the first sample at which there are both. It does so, too, after an input was held for
 more than a few samples: what a held reference does to an observer that watches tracking errors grows with every sample,
 and a start costs no more than a start. Parameters stay.
 """

@@ -158,7 +158,7 @@ class Course:
         if self._before is not None:
             lead = len(self._before.y)
             return samples.after(self._before) if lead else samples, lead
-        self.steps.begin(samples.y[0], u=np.where(samples.starts[0][:, None], samples.u[0], 0.0))
+        self.steps.begin(samples.y[0], u=samples.u[0])
         later = samples.starts.copy()
         later[0] = False
         return replace(samples, starts=later), 0

@@ -30,7 +30,10 @@ class Estimator(Method):
         settings = models.sample_period_s, models.parameters_of(task.unit), self.settings
         poles = np.linalg.eigvals(models.A[models.index(task.unit)]).tolist()
         identified = identify_estimator(task.name, *channels, recordings, *settings, poles)
-        observer = replace(identified.observer, seen=self._seen(task), sensor=task.sensor)
+        observer = identified.observer
+        start = np.pad(training.runtime.first(len(observer.recorded)), (0, observer.internal))
+        runtime = replace(observer.runtime, start=start)
+        observer = replace(observer, seen=self._seen(task), sensor=task.sensor, runtime=runtime)
         seconds = time.perf_counter() - began
         synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)
         return Design(task.name, observer, synthesis, identified.facts)

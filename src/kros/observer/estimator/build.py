@@ -17,7 +17,7 @@ from ..observer import Observer
 from ..runtime import Runtime
 from .certificate import outside_percent
 from .channels import FAMILIES, channels_of
-from .gaps import decay_of, with_gaps
+from .gaps import distances, with_gaps
 from .reduction import Filters, reduced
 from .regression import Readout, is_less
 from .rows import Design, Recordings
@@ -97,15 +97,23 @@ def identify_estimator(
 
     filters, fallback = filters_of(readout, blind, [settings.order] * 2)
     observer = observer_of(filters, fallback)
-    group, unseen = readout.left_out_group()
     orders = len(filters.A), len(fallback.A)
-    trial = observer_of(*filters_of(readout.without(group), blind.without(group), orders))
+    F, apart = distances(observer, recordings, settings, held)
+    near = [i for i in measured if i not in held]
 
-    F = decay_of(observer, recordings, settings, held)
-    observer, trial = (replace(let_go(one, F), runtime=bounded(one, recordings, settings)) for one in (observer, trial))
+    def complete(one: Observer) -> Observer:
+        assert one.bank is not None
+        reach = one.bank.reach.copy()
+        reach[near] = settings.reach * apart[near]
+        return replace(let_go(one, F), runtime=bounded(one, recordings, settings), bank=replace(one.bank, reach=reach))
+
+    trials = [
+        (complete(observer_of(*filters_of(readout.without(group), blind.without(group), orders))), unseen)
+        for group, unseen in readout.left_out_groups()
+    ]
+    observer = complete(observer)
     assert observer.bank is not None
-    assert trial.bank is not None
-    bank = with_gaps(observer.bank, trial, F, unseen, settings)
+    bank = with_gaps(observer.bank, trials, F, settings)
     observer = replace(observer, bank=bank)
     states = lifting.states
 
@@ -229,8 +237,7 @@ def assembled(
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[:n] for end in design.recordings.ranges)
-    reach = np.where(np.isin(x, at), design.settings.reach * design.recordings.size, high - low)
-    gaps = FilterBank(r, start, np.ones(n), np.zeros(n), reach, np.exp([-1 / slowest]))
+    gaps = FilterBank(r, start, np.ones(n), np.zeros(n), high - low, np.exp([-1 / slowest]))
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(

@@ -191,12 +191,16 @@ class Readout:
             careful_unaware,
         )
 
-    def left_out_group(self) -> tuple[Group, Recordings]:
-        """Return a group, and the recordings of its fold and part: what `without` it does not know."""
-        groups, recordings = self.design.groups, self.design.recordings
-        first = groups[recordings.keys[0]]
-        same = [(groups[key].fold, groups[key].part) == (first.fold, first.part) for key in recordings.keys]
-        return first, recordings.only(same)
+    def left_out_groups(self) -> list[tuple[Group, Recordings]]:
+        """Return a group of every fold, and the recordings of its fold and part: what `without` it does not know."""
+        groups, recordings, parts = self.design.groups, self.design.recordings, self.design.settings.parts
+        found = []
+        for fold in dict.fromkeys(group.fold for group in self.others):
+            of_fold = [group for group in self.others if group.fold == fold]
+            chosen = min(of_fold, key=lambda group: (group.part - group.fold) % parts)
+            same = [(groups[key].fold, groups[key].part) == (fold, chosen.part) for key in recordings.keys]
+            found.append((chosen, recordings.only(same)))
+        return found
 
     @property
     def typical(self) -> Array:

@@ -105,9 +105,10 @@ class EstimatorSettings(Settings):
         description="least and largest value that a state can have, as the current of a drive; estimates stay inside",
     )
     reach: float = Field(
-        0.25,
+        1.0,
         ge=0,
-        description="share of its range by which a missing measurement may differ from the fallback",
+        description="distance that a missing measurement may have from the fallback, in RMS distances of recorded ones "
+        "from what the inputs say",
     )
     gap_samples: int = Field(
         240_000, ge=100, description="samples on which losses are simulated in training, over all episodes"

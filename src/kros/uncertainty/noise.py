@@ -20,11 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core import (
-    AnyArray,
-    frozen,
-    save_artifact,
-)
+from ..core import AnyArray, frozen, save_artifact
 from ..core.linalg import energy, pieces, sigma_max
 from ..identify.edmd import ModelSamples
 from .forms import Form, evenly, residual

@@ -15,14 +15,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from ..core import (
-    AnyArray,
-    StateSpace,
-    Storable,
-    block_diagonal,
-    frozen,
-    gain,
-)
+from ..core import AnyArray, StateSpace, Storable, block_diagonal, frozen, gain
 from ..core.linalg import sigma_max
 from .forms import Form, residual
 from .settings import SET

@@ -1,14 +1,17 @@
 r"""Log-Chebyshev fit of one magnitude by a stable, minimum-phase system from above.
 
 Of all squared magnitudes `n / d` of one order with `m^2 <= n / d <= gamma m^2` on the grid, the one with the smallest
-`gamma` is found: a quasi-convex problem in the coefficients a and b of n and d. Dinkelbach's iteration solves it by
-linear programs, with `e` the denominator of the step before and mean(d / e) = 1:
+`gamma` is found: a quasi-convex problem in the coefficients a and b of n and d. With `f = m^2`, the gamma and the
+denominator `e` of the step before, Dinkelbach's iteration solves quadratic programs
 
-    minimise t  s.t.  d_i <= n_i / f_i,  n_i / (gamma f_i) - d_i <= t e_i
+    minimise sum_i (h_i^2 + below^2 l_i^2)  s.t.  h_i = (gamma d_i - n_i / f_i) / e_i >= const,
+                                                  l_i = (n_i / f_i - d_i) / e_i >= 0
 
-It converges superlinearly to the global optimum, from any denominator. Rows are relative to the denominator, columns to
-their largest entry, because programs are solved to absolute tolerances. After every program the true ratios are
-recomputed, `n` is lifted by the deficit, and both are proven positive on the whole axis by the location of their roots.
+Each has a solution of a smaller ratio unless there is none. The iteration converges superlinearly to the global
+optimum, from any denominator; of several optima it takes one that is near the data. The objective is the squared norm
+of coefficients that are orthonormalised, so that each program is one of nonnegative least squares (Lawson and Hanson).
+After every program the true ratios are recomputed, `n` is lifted by the deficit, and both are proven positive on the
+whole axis by the location of their roots.
 
 Squared magnitudes are rational in tau:
 
@@ -24,6 +27,7 @@ because they spread over twice as many decades as the frequencies.
 References
 ----------
 W. Dinkelbach, "On nonlinear fractional programming", Management Science 13 (1967) 492-498.
+C. L. Lawson and R. J. Hanson, "Solving Least Squares Problems", Prentice-Hall (1974), chapter 23.
 """
 
 from __future__ import annotations
@@ -48,6 +52,7 @@ from ...core import (
     frozen,
     gain,
 )
+from ...core.linalg import qr_triangle
 from ..forms import check_grid
 from ..settings import MAGNITUDE, WEIGHT
 from .sections import Sections, bilinear_squared
@@ -222,11 +227,8 @@ class _Grid:
 
     def best(self, gamma: float) -> RationalMagnitude | None:
         """Return the bound of the smallest ratio; None where none is below gamma."""
-        best, scale, settled = None, self.targets**-0.5, False  # n and d share the slope
-        while not settled:
-            solution = self._solved(scale, gamma)
-            if solution is None:
-                break
+        best, scale = None, self.targets**-0.5  # n and d share the slope
+        while (solution := self._solved(scale, gamma)) is not None:
             n, d = self.phi @ solution[0], self.phi @ solution[1]
             if not ((d > 0) & (n > 0)).all():
                 break
@@ -235,29 +237,28 @@ class _Grid:
             if spread >= gamma * MAGNITUDE.settled:
                 break
             best = RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots)
-            gamma, scale, settled = spread, d, spread < MAGNITUDE.exact
+            gamma, scale = spread, d
+            if spread < MAGNITUDE.exact:
+                break
         return best
 
     def _solved(self, scale: AnyArray, gamma: float) -> tuple[AnyArray, AnyArray] | None:
-        """Minimise t over (a, b, t); return a and b."""
-        from scipy.optimize import linprog
+        """Return a and b, up to a factor, of the program's solution."""
+        from scipy.optimize import nnls
 
         d = self.phi / scale[:, None]
-        n = d / self.targets[:, None]
-        edge, size = self.edge / scale[self.nearest, None], self.phi.shape[1]
-        one, none = np.ones((len(n), 1)), np.zeros_like(edge)
-        ends = [edge / self.targets[self.nearest, None], none, none[:, :1]], [none, edge, none[:, :1]]
-        with np.errstate(all="ignore"):
-            unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
-            table = np.block([[n / gamma, -d, -one], [-n, d, 0 * one], *ends]) * unit
-            table /= np.abs(table).max(axis=1, keepdims=True)
-        if not np.isfinite(table).all():  # a basis function that is zero on the grid
+        n, none = d / self.targets[:, None], np.zeros_like(self.edge)
+        high, low = np.hstack([-n, gamma * d]), np.hstack([n, -d])
+        ends = np.block([[-self.edge / self.targets[self.nearest, None], none], [none, -self.edge]])
+        limits = np.repeat([len(n) ** -0.5, 0.0], [len(n), len(n) + len(ends)])
+        try:
+            R = qr_triangle(np.vstack([high, MAGNITUDE.below * low]))
+            rows = np.vstack([np.linalg.solve(R.T, np.vstack([high, low, ends]).T), limits])
+            solution = rows[:-1] @ nnls(rows, np.eye(len(rows))[-1])[0]
+            a, b = np.split(np.linalg.solve(R, solution), 2)
+        except (np.linalg.LinAlgError, ValueError, RuntimeError):  # a basis function that is zero on the grid
             return None
-        norm = np.concatenate([np.zeros(size), d.mean(axis=0), [0.0]]) * unit
-        cost, zero = np.eye(2 * size + 1)[-1], np.zeros(len(table))
-        exact = dict.fromkeys(("primal_feasibility_tolerance", "dual_feasibility_tolerance"), 1e-10)
-        solved = linprog(cost, table, zero, norm[None], [1.0], (None, None), "highs-ds", options=exact)
-        return (solved.x[:size] * unit[:size], solved.x[size:-1] * unit[size:-1]) if solved.status == 0 else None
+        return a, b
 
 
 _ROUNDING = 4096 * EPS

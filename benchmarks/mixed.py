@@ -116,7 +116,7 @@ def solve(task: DesignTask) -> tuple[str, float, bool]:
     )
     error, free = percent_of([result.observer, task.observer(task.open_loop())], judge)
     return (
-        f"{n_states:2d} states, K {found.controller.n_states:2d} {found.status.value:10s} {used:6.2f} s ({wall:6.2f} s wall) {found.solver:9s} "
+        f"{n_states:2d} states, K {found.controller.n_states:2d} {found.status.value:10s} {used:6.2f} s ({wall:6.2f} s wall) "
         f"H2 {found.h2_norm:.4g} Hinf {found.hinf_norm:.4f} worst case {found.worst_case_h2:.4g} (open {nothing:.4g}) "
         f"error {np.array2string(error, precision=3)} (open {np.array2string(free, precision=3)})",
         used,

@@ -127,9 +127,7 @@ def _observers(context: Context) -> Record:
     for name in record["names"]:
         synthesis = Synthesis.load(context.store.path("synthesis", name))
         bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
-        entries[name] |= {
-            key: getattr(synthesis, key) for key in ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)
-        }
+        entries[name] |= {key: getattr(synthesis, key) for key in ("status", "h2_norm", "hinf_norm", *bounds)}
     return {"observers": entries, "deployment": _deployment(context)}
 
 

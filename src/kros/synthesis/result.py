@@ -79,8 +79,6 @@ class Synthesis(Storable):
     gap_percent: float | None = None  # ``100 (value / lower_bound - 1)``
     quadrature_error: float | None = None  # of `worst_case_h2`, already included in it
     spectral_radius: float | None = None  # of the nominal loop (continuous: the largest real part)
-    solve_s: float = 0.0  # s, without the fitting of weights
-    solver: str = ""
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import field, replace
 
 import numpy as np
@@ -23,7 +22,7 @@ class Estimator(Method):
 
     def design(self, task: DesignTask) -> Design:
         """Identify the estimator."""
-        began, models, training = time.perf_counter(), task.models, task.recordings
+        models, training = task.models, task.recordings
         bias = np.array([task.sensor.get(models.lifting.states[i], Sensor()).bias for i in models.measured])
         recordings = Recordings.of(training.keys, training.read_one, bias)
         channels = models.lifting, models.measured, models.recorded_inputs
@@ -34,8 +33,7 @@ class Estimator(Method):
         start = np.pad(training.runtime.first(len(observer.recorded)), (0, observer.internal))
         runtime = replace(observer.runtime, start=start)
         observer = replace(observer, seen=self._seen(task), sensor=task.sensor, runtime=runtime)
-        seconds = time.perf_counter() - began
-        synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)
+        synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection)
         return Design(task.name, observer, synthesis, identified.facts)
 
     def _seen(self, task: DesignTask) -> Seen | None:

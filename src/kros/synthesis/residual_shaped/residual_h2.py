@@ -31,7 +31,6 @@ spectral estimator", IEEE Transactions on Signal Processing 48 (2000) 3189-3205.
 
 from __future__ import annotations
 
-import time
 from dataclasses import field, replace
 from functools import cached_property
 
@@ -226,7 +225,6 @@ def residual_h2(
     max_order: int | None = None,
 ) -> Synthesis:
     """Return the correction that is optimal for residuals; reducing its order costs each hidden state the tolerance."""
-    start = time.perf_counter()
     full = problem.filter()
     most = full.n_states if max_order is None else max_order
     K = problem.reduced(full, problem.correction(full), tolerance_percent, most)
@@ -245,8 +243,6 @@ def residual_h2(
         lower_bound=lower,
         gap_percent=gap,
         spectral_radius=problem.error_system(K).largest_pole(),
-        solve_s=time.perf_counter() - start,
-        solver="riccati",
         notes=(note, *notes),
     )
 

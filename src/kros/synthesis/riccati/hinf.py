@@ -22,8 +22,6 @@ gamma : level;  K : controller
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 from scipy.linalg import null_space
 
@@ -76,7 +74,6 @@ def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
     if not ITERATED <= tolerance < 1:
         raise ConfigError(f"H-infinity synthesis: tolerance should lie in [1e-9, 1), found {tolerance}.")
     require(plant, "H-infinity synthesis", proper=False)
-    start = time.perf_counter()
     idle = _closed(plant, gain(np.zeros((plant.sizes[2], plant.sizes[4])), plant.dt))
     negligible = ITERATED * idle.norm if np.isfinite(idle.norm) else 0.0
     trivial = 0 in plant.sizes[2::2]
@@ -97,8 +94,6 @@ def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
         lower_bound=lower_bound,
         gap_percent=gap,
         spectral_radius=closed.largest_pole(),
-        solve_s=time.perf_counter() - start,
-        solver="riccati",
         notes=notes,
     )
 

@@ -109,7 +109,6 @@ def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> 
         worst_case_h2=value,
         quadrature_error=error,
         spectral_radius=loop.largest_pole(),
-        solver="riccati",
     )
 
 

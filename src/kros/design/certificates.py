@@ -30,7 +30,7 @@ from ..observer.estimator.gaps import losses
 from ..observer.runtime import Guard
 from ..observer.simulate import run_observers
 from ..synthesis import ObserverProblem
-from ..synthesis.worst_case.certificate import attained, certify_errors
+from ..synthesis.worst_case.certificate import certify_errors
 from ..uncertainty import UncertainModel
 from .monitor import settling
 from .task import Design, DesignTask
@@ -236,7 +236,6 @@ def certificate(task: DesignTask, design: Design) -> Record:
         bound = certify_errors(problem, errors, mean)[0]
         if observer.bank is not None:
             facts["constant_h2"] = float(np.linalg.norm(mean))
-            facts["worst_case_h2_attained"] = attained(problem, errors, mean)
             require_useful(problem, observer, bound)
         return facts | {"worst_case_h2": bound}
     except SynthesisError as error:

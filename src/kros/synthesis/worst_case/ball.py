@@ -1,4 +1,4 @@
-r"""The uncertain set per frequency: a matrix ball, its worst element and its average.
+r"""The uncertain set per frequency: a matrix ball, its bound and its average.
 
 With ``N = W_R W_L``, ``||N|| < 1`` and ``X = Delta (I - N Delta)^-1``, completing the square in ``||Delta|| <= 1``
 gives
@@ -24,9 +24,9 @@ Theta^H] = I ||Q||_F^2 / max(a, b)`` (`Ball.average`).
 from __future__ import annotations
 
 import numpy as np
-from numpy.linalg import norm, svd
+from numpy.linalg import svd
 
-from ...core import AGREED, EPS, TINY, AnyArray, frozen
+from ...core import EPS, TINY, AnyArray, frozen
 from ...core.linalg import adjoint, energy
 from ..problem.observer_problem import ObserverProblem
 
@@ -59,27 +59,6 @@ class Ball:
         share = energy(self.right) / max(self.right.shape[-2], self.left.shape[-1])
         return self.center @ adjoint(self.center) + share[..., None, None] * (self.left @ adjoint(self.left))
 
-    def worst(self, T: AnyArray, certain: AnyArray | float = 0.0, iterations: int = 15) -> AnyArray:
-        """Contraction of an element that is (locally) worst for ``certain + T X M``, shape (f, b, a)."""
-        P, Qh = T @ self.left, adjoint(self.right)
-        left, right = adjoint(svd(P)[2]), svd(self.right)[0]
-        k = min(P.shape[-1], self.right.shape[-2])
-        starts = (
-            polar(adjoint(self.left) @ self.center @ Qh),  # aligned with the centre
-            polar(adjoint(P) @ (certain + T @ self.center) @ Qh),  # aligned with the centre, as T sees it
-            left[..., :k] @ adjoint(right)[..., :k, :],  # worst without the centre
-        )
-        best, best_value = starts[0], np.full(T.shape[:-2], -1.0)
-        for theta in starts:
-            for k in range(iterations + 1):
-                error = certain + T @ (self.center + self.left @ theta @ self.right)
-                value = norm(error, axis=(-2, -1))
-                better = value > best_value * (1 + AGREED) if k in (0, iterations) else np.zeros_like(value, bool)
-                best = np.where(better[..., None, None], theta, best)
-                best_value = np.where(better, value, best_value)
-                theta = polar(adjoint(P) @ error @ Qh)
-        return best
-
 
 def uncertain_ball(problem: ObserverProblem, freqs_hz: AnyArray) -> Ball:
     """Return the ball of ``Delta (I - N Delta)^-1 M`` of a problem at frequencies."""
@@ -97,12 +76,6 @@ def _with_gains(U: AnyArray, gains: AnyArray) -> AnyArray:
     """Return ``U diag(gains, 1, ...) U^H``."""
     gains = np.concatenate([gains, np.ones((*gains.shape[:-1], U.shape[-1] - gains.shape[-1]))], axis=-1)
     return (U * gains[..., None, :]) @ adjoint(U)
-
-
-def polar(matrix: AnyArray) -> AnyArray:
-    """Return the unitary polar factors, shape (f, a, b)."""
-    U, _, Vh = svd(matrix, full_matrices=False)
-    return U @ Vh
 
 
 def dual_bound(a: AnyArray, P: AnyArray, Q: AnyArray) -> AnyArray:

@@ -29,9 +29,7 @@ from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from .ball import spread, uncertain_ball
 
-Density = Callable[[ObserverProblem, StateSpace, AnyArray], AnyArray]
-
-_ACCURACY = 1e-5  # of the quadrature, relative; a hundred times as much for what is attained
+_ACCURACY = 1e-5  # of the quadrature, relative
 
 
 def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) -> AnyArray:
@@ -42,14 +40,6 @@ def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) ->
         left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
         uncertain = uncertain + spread(response @ left, right)
     return uncertain**2 + noise
-
-
-def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) -> AnyArray:
-    """Power density of ``W_p e``, shape (f,), for a perturbation that is locally worst; without the remainder."""
-    _, T, certain, noise = _responses(problem, errors, freqs_hz)
-    ball = uncertain_ball(problem, freqs_hz)
-    response = certain + T @ (ball.center + ball.left @ ball.worst(T, certain) @ ball.right)
-    return energy(response) + noise
 
 
 def _responses(
@@ -71,20 +61,14 @@ def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, fl
 
 def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> tuple[float, float]:
     """Return what `certify` returns, for the error system from (d, r, n[, s]) and the mean of ``W_p e``."""
-    squared, error = _mean_square(problem, errors, density, _ACCURACY)
+    squared, error = _mean_square(problem, errors)
     squared += float(np.sum(np.square(mean)))
     upper = float(np.sqrt(squared + error))
     return upper, upper - float(np.sqrt(squared))
 
 
-def attained(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> float:
-    """Return a lower bound of this very observer's worst case: what a perturbation attains at every frequency."""
-    squared, error = _mean_square(problem, errors, attained_density, 100 * _ACCURACY)
-    return float(np.sqrt(max(squared - error, 0.0) + np.sum(np.square(mean))))
-
-
-def _mean_square(problem: ObserverProblem, errors: StateSpace, of: Density, rtol: float) -> tuple[float, float]:
-    """Return the mean of a density over all frequencies and the quadrature error."""
+def _mean_square(problem: ObserverProblem, errors: StateSpace) -> tuple[float, float]:
+    """Return the mean of the density over all frequencies and the quadrature error."""
     problem.require_sound()
     if not errors.is_stable():
         radius = float(errors.spectral_radius())
@@ -93,7 +77,7 @@ def _mean_square(problem: ObserverProblem, errors: StateSpace, of: Density, rtol
     systems = [errors, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
     poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
     poles = poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]
-    return circle_mean(lambda theta: of(problem, errors, theta / rate), np.log(poles), rtol)
+    return circle_mean(lambda theta: density(problem, errors, theta / rate), np.log(poles), _ACCURACY)
 
 
 def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> Synthesis:

@@ -412,13 +412,12 @@ def figures(run_folder: Run, out: Path) -> None:
 @app.command()
 def compare(
     run_folders: Annotated[list[Path], _argument("RUN RUN...")],
-    out: Annotated[Path | None, _option("Write an HTML page.", metavar="FILE")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Show runs beside each other: settings, recordings, errors, weights, certificates."""
+    """Show in what runs differ: settings, recordings, errors, weights, certificates."""
     from .study.commands.summary import compare_runs
 
-    _show(quiet, *compare_runs(run_folders, out))
+    _show(quiet, *compare_runs(run_folders))
 
 
 @app.command("list")

@@ -7,13 +7,12 @@ import shutil
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
-from ...core import ConfigError, Record, write_bytes
+from ...core import ConfigError, Record
 from ...loops.compiler import COMPILERS
-from ...report.compare import comparison, lines, sections
-from ...report.content import Column, Row, Section, build
+from ...report.compare import aligned, compared, differences, lines
 from ...report.facts import Facts
-from ...report.html import filled
 from ..config import Stage
 from ..engine.context import open_finished
 from ..engine.store import METRICS
@@ -48,13 +47,13 @@ def _version(name: str, otherwise: str) -> str:
 
 def ranking(facts: Facts) -> list[str]:
     """Return one line an observer, the smallest error of the hidden channels first."""
-    table, hidden, rows = facts.table, facts.table.hidden(), list[Row]()
+    table, hidden = facts.table, facts.table.hidden()
+    rows = list[Sequence[Any]]()
     for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
         means = {channel: cell.shown for channel, cell in table.cells[name].items()}
-        rows.append({"": f"{name}{'  <- deployed' if name == facts.deployed else ''}", **means})
+        rows.append((f"{name}{'  <- deployed' if name == facts.deployed else ''}", *map(means.get, hidden)))
     title = "observers by mean error on held-out episodes, percent of the largest value:"
-    shown = build("", [Column(name) for name in ("", *hidden)], rows)
-    return lines(Section("", title, tables=[shown]))[1:] if shown else []
+    return [title, *aligned([("", *hidden), *rows])] if rows else []
 
 
 def list_run(run: Path) -> list[str]:
@@ -71,20 +70,16 @@ def list_run(run: Path) -> list[str]:
         return [*lines, "the run has not ended; the same command of kros run goes on with it"]
 
 
-def compare_runs(runs: Sequence[Path], out: Path | None) -> tuple[Record, list[str]]:
-    """Return finished runs beside each other, as content of JSON and as lines; written as a page to `out`."""
+def compare_runs(runs: Sequence[Path]) -> tuple[Record, list[str]]:
+    """Return in what finished runs differ, as content of JSON and as lines."""
     if len(set(runs)) < 2:
         raise ConfigError(f"Compare: at least two runs are needed, found {len(set(runs))}; name another run folder.")
     names = [run.name for run in runs] if len({run.name for run in runs}) == len(runs) else list(map(str, runs))
-    read = {}
-    for name, run in zip(names, runs, strict=True):
+    read = []
+    for run in runs:
         with open_finished(run) as context:
             if not (run / METRICS).exists():
                 raise ConfigError(f"Run {run}: has not ended; the same command of kros run goes on with it.")
-            read[name] = context.config.dump(), Facts(context.store.metrics())
-    compared = comparison(read)
-    shown = sections(names, compared)
-    if out is not None:
-        write_bytes(out, filled(" and ".join(names), "runs beside each other", shown).encode())
-    written = ["", f"page: {out}"] if out is not None else []
-    return {"runs": names, **compared}, [line for section in shown for line in lines(section)] + written
+            read.append(compared(context.config.dump(), Facts(context.store.metrics())))
+    differing = differences(read)
+    return {"runs": names, **differing}, lines(names, differing)

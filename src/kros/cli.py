@@ -352,12 +352,11 @@ def estimate(
     out: Annotated[Path, _argument("OUT", "New file, .parquet or .csv")],
     parameter: Annotated[Names, _option("Of a unit, as its phase; repeatable.", metavar="UNIT.NAME=VALUE")] = None,
     track: Track = None,
-    plot: Annotated[Path | None, _option("Draw the first episode, .png", metavar="FILE")] = None,
 ) -> None:
     """Write the deployed observer's estimates on recordings; no hidden channels are needed."""
     from .study.commands.estimate import estimate_recordings
 
-    _say(estimate_recordings(run_folder, data, out, parameter or (), track, plot))
+    _say(estimate_recordings(run_folder, data, out, parameter or (), track))
 
 
 @export.command("c")

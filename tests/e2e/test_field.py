@@ -104,7 +104,7 @@ def table(path: Path) -> tuple[list[str], np.ndarray]:
 def test_csv_and_parquet_say_the_same_with_units_and_sources(kros, demo, field, tmp_path, machines) -> None:
     data, columns = field(), ["position_hat", "velocity_hat", "current_hat"]
     for out in ("x.csv", "x.parquet"):
-        result = kros("estimate", demo, data, tmp_path / out, "--plot", tmp_path / "x.png")
+        result = kros("estimate", demo, data, tmp_path / out)
         assert result.exit_code == 0, result.output
         assert result.output.count("parameters calibrated on the derivative of position") == 3
     assert pq.ParquetFile(tmp_path / "x.parquet").num_row_groups == len(machines.episodes)
@@ -128,7 +128,6 @@ def test_csv_and_parquet_say_the_same_with_units_and_sources(kros, demo, field, 
     stated = json.loads((demo / "metrics.json").read_text())
     bound = stated["observers"][stated["study"]["deployed"]]["set_bound"]
     assert found["velocity_band"].to_pylist()[0] == pytest.approx(bound["velocity"], rel=1e-9)
-    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads(found.schema.metadata[b"parameters"]) == facts["parameters"]
     assert {p["source"] for p in facts["parameters"].values()} == {"calibrated on the derivative of position"}
     whole = machines.read(machines.episodes[2])[:, :3]  # the first good drive's first episode
@@ -204,7 +203,6 @@ def test_what_does_not_fit_is_said(kros, lifted, field, tmp_path) -> None:
     data.write_text(text)
     refused("UNIT.NAME=VALUE", more=("--parameter", "nobody.phase=1"))
     refused("parameters are phase", more=("--track", "lag"))
-    refused("should end in .png", more=("--plot", "x.gif"))
 
 
 def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> None:

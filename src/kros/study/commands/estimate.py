@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core import ConfigError, Record, write_bytes
+from ...core import ConfigError, Record
 from ...export.estimates import ENDINGS, writer
 from ...observer import recorded_channel, recorded_factors
 from ..config import Stage
@@ -17,37 +17,28 @@ from .field import FieldRecordings, status_counts
 
 
 def estimate_recordings(
-    run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None, plot: Path | None = None
+    run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None
 ) -> list[str]:
-    """Write what `facts_of` names for every sample, and a plot of the first episode; return what people read.
+    """Write what `facts_of` names for every sample; return what people read.
 
     The band is the bound of the RMS error for recorded signals, where the observer has one and the sample is good.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
         if out.exists() or out.suffix not in ENDINGS:
             raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
-        if plot is not None and plot.suffix != ".png":
-            raise ConfigError(f"--plot {plot}: should end in .png.")
         recordings = FieldRecordings.open(context, data, given, track)
         observer, population = recordings.observer, recordings.population
         names = observer.recorded
         stated = context.observers_record["facts"].get(observer.name, {})
         bound = np.array([stated.get("set_bound", {}).get(name) for name in names], dtype=float)
         factors = recorded_factors(observer, [*(c.name for c in population.channels), *names])
-        counts, n, first = defaultdict[str, Counter[str]](Counter), len(names), None
+        counts, n = defaultdict[str, Counter[str]](Counter), len(names)
         with writer(out, population.sample_period_s, facts_of(recordings)) as write:
             for key, start, columns, status, recorded in recordings.estimates():
                 band = np.where(status[:, None] == 0, bound / np.abs(factors[-n:]), np.nan)
                 values = np.hstack([np.hstack([recorded, columns[:, :n]]) / factors, band, columns[:, n:]])
                 write(key, start, status, values)
                 counts[key.unit].update(status_counts(status))
-                first = values if first is None else first
-    if plot is not None and first is not None:
-        from ...report.estimates import estimates_png
-
-        drawn = dict(zip(facts_of(recordings)["columns"], first.T, strict=True))
-        units = {name: recorded_channel(observer, name).unit for name in names}
-        write_bytes(plot, estimates_png(population.sample_period_s, drawn, units))
     count = len(population.episodes)
     lines = [f"estimates of {count} episode{'s' * (count != 1)} in {out}"]
     for unit in dict.fromkeys([*recordings.sources, *(unit for unit, of_unit in counts.items() if of_unit)]):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import dstep, lfilter
+from scipy.signal import lfilter
 
 import kros
 from kros.core.errors import ConfigError
@@ -102,19 +102,6 @@ def test_the_fit_is_that_of_the_simulation(models: IdentifiedModels) -> None:
     assert figure.axes[5].get_title(loc="left") == f"fit {percent:.1f} %"
     with pytest.raises(ConfigError, match="unit 'x' has no episode in condition 'default'"):
         models.plot("compare", unit="x")
-
-
-def test_step_responses_are_those_of_scipy(models: IdentifiedModels) -> None:
-    one = models.models()
-    time_s, responses = one.step_responses(40)
-    A, B = one.A[1], one.B[1]
-    _, (expected,) = dstep((A, B, np.eye(3), np.zeros((3, 1)), PERIOD), n=round(time_s[-1] / one.sample_period_s) + 1)
-    stride = round(time_s[1] / one.sample_period_s)
-    assert stride > 1
-    assert np.allclose(responses[1, :, :, 0], expected[::stride], rtol=1e-9, atol=1e-12)
-    panels = one.plot("step").axes
-    assert [panel.get_ylabel() for panel in panels] == ["position\n(rad)", "velocity\n(rad/s)", "current\n(A)"]
-    assert panels[0].get_title(loc="left") == "voltage:\nstep of 1 V"
 
 
 def test_the_phase_of_a_bode_plot_is_that_of_python_control(models: IdentifiedModels) -> None:

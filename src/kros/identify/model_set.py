@@ -137,20 +137,6 @@ class ModelSet(Shown, Storable):
         """Return the same with every signal divided by its range."""
         return self.normalised().systems(units).frequency_response(freqs_hz)
 
-    def step_responses(self, points: int) -> tuple[AnyArray, AnyArray]:
-        """Return times, s, and responses of states from rest to unit steps of the inputs, (unit, time, n, m).
-
-        They last until the slowest pole has decayed to 1 %, at most about as long as the longest episode.
-        """
-        slowest, period = self.spectral_radius().max(), self.sample_period_s
-        settled = np.log(0.01) / np.log(slowest) if 0 < slowest < 1 else points
-        stride = int(np.ceil(min(settled, (self.longest_s or np.inf) / period) / points))
-        state, states = np.zeros_like(self.B), []
-        for sample in range(points * stride + 1):
-            states += [] if sample % stride else [state[:, : self.lifting.n_states]]
-            state = self.A @ state + self.B
-        return np.arange(len(states)) * stride * period, np.stack(states, axis=1)
-
     def systems(self, units: Sequence[str] | None = None) -> StateSpace:
         """Return the models as a batch from input to lifted state, all of it or some units."""
         rows = [self.index(u) for u in units] if units is not None else slice(None)

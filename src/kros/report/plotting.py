@@ -13,10 +13,9 @@ from .theme import style
 _ESTIMATES = {"estimates": "episodes:design_figure"}
 PLOTS: dict[str, dict[str, str]] = {
     "Population": {"recorded": "recordings:population_figure", "excitation": "recordings:excitation_figure"},
-    "ModelSet": {"bode": "models:bode_figure", "step": "models:step_figure"},
+    "ModelSet": {"bode": "models:bode_figure"},
     "IdentifiedModels": {
         "bode": "models:identified_bode",
-        "step": "models:identified_step",
         "residuals": "models:residuals_figure",
         "compare": "episodes:compare_figure",
     },

@@ -1,4 +1,4 @@
-"""Identified models: magnitude and phase, step responses of every unit, and correlations of one-step residuals."""
+"""Identified models: magnitude and phase of every unit, and correlations of one-step residuals."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from ...evaluate.validation import correlation
 from ...identify import IdentifiedModels, ModelSet
 from ...observer import one_step_residual
 from ..canvas import Captioned, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, set_titles
-from ..names import model_label, model_look, readable_unit, words
+from ..names import model_label, model_look, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
 from .entries import short
-from .episodes import label_rows, shown_episode
+from .episodes import shown_episode
 
 
 def bode(run: RunFolder) -> Captioned:
@@ -26,11 +26,6 @@ def bode(run: RunFolder) -> Captioned:
 def identified_bode(models: IdentifiedModels, model: str | None = None, condition: str | None = None) -> Figure:
     """Draw models of one kind, the first by default, in the condition that feeds synthesis or another."""
     return bode_figure(models.models(model, condition))
-
-
-def identified_step(models: IdentifiedModels, model: str | None = None, condition: str | None = None) -> Figure:
-    """Draw the step responses of the same."""
-    return step_figure(models.models(model, condition))
 
 
 def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
@@ -50,23 +45,6 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
         panel.set_ylabel("" if j else short(models.lifting.names[i]))
     for j, panel in enumerate(axes[0]):
         panel.set_title(f"{words(models.inputs[j // 2])}:\n{'phase (°)' if j % 2 else 'magnitude (dB)'}")
-    legend(axes[0, 0])
-    return figure
-
-
-def step_figure(models: ModelSet) -> Figure:
-    """Draw the responses of the states of every unit to a unit step of every input, a column an input."""
-    time_s, responses = models.step_responses(DRAWING.points)
-    channels, inputs = models.channels[: models.lifting.n_states][: DRAWING.states], models.inputs[: DRAWING.states]
-    units = {c.name: readable_unit(c.unit) for c in models.channels}
-    figure, axes = grid(len(channels), len(inputs), sharex=True)
-    for (i, j), panel in np.ndenumerate(axes):
-        lines, colour = responses[..., i, j], model_look(models.name).colour
-        lines_of_units(panel, time_s, lines, colour, f"{len(lines)} units", models.unit_ids)
-        panel.margins(x=0)
-    set_titles(axes[0], (f"{short(name)}:\nstep of 1 {units.get(name, '')}" for name in inputs))
-    label_rows(axes[:, 0], channels)
-    label_below(axes[-1], "time (s)")
     legend(axes[0, 0])
     return figure
 

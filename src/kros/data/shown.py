@@ -35,13 +35,10 @@ class Shown:
         Parameters
         ----------
         kind : str, optional
-            What is drawn, the first by default. A population: ``"recorded"``, an episode, or ``"excitation"``, spectra
-            of the inputs and the ordinary coherence of each input with each state over the episodes of a unit (other
-            inputs count as noise). Models: ``"bode"``, magnitude and phase. Identified models also: ``"residuals"``, the autocorrelation of one-step residuals
-            and their correlation with earlier inputs, with the 99 % band of white noise, or ``"compare"``, simulated
-            beside recorded states with the fit ``100 (1 - |x - x_hat| / |x - mean(x)|)``, percent. Uncertain models:
-            ``"weights"``, the bound of the residuals. A design, an observer: ``"estimates"``. A run:
-            ``"figure"``.
+            What is drawn, the first by default. A population: ``"recorded"``, an episode. Models: ``"bode"``, magnitude
+            and phase. Identified models also: ``"compare"``, simulated beside recorded states with the fit
+            ``100 (1 - |x - x_hat| / |x - mean(x)|)``, percent. Uncertain models: ``"weights"``, the bound of the
+            residuals. A design, an observer: ``"estimates"``. A run: ``"figure"``.
         **options
             ``unit`` and ``condition`` of recordings, by default the first held-out episode; ``model`` of identified and
             uncertain models, such as ``"linear"`` (in other conditions than that of synthesis those of EDMD only);

@@ -12,11 +12,10 @@ from .theme import style
 
 _ESTIMATES = {"estimates": "episodes:design_figure"}
 PLOTS: dict[str, dict[str, str]] = {
-    "Population": {"recorded": "recordings:population_figure", "excitation": "recordings:excitation_figure"},
+    "Population": {"recorded": "recordings:population_figure"},
     "ModelSet": {"bode": "models:bode_figure"},
     "IdentifiedModels": {
         "bode": "models:identified_bode",
-        "residuals": "models:residuals_figure",
         "compare": "episodes:compare_figure",
     },
     "UncertainModel": {"weights": "uncertainty:uncertain_figure"},

@@ -35,9 +35,6 @@ class Drawing:
     settled: float = 0.1  # share of an episode after which errors are drawn: at the start no observer knows the state
     diverged: float = 1e3  # ranges of the signal: a larger error is not drawn
     segment: int = 1024  # samples of a spectrum
-    averages: int = 8  # segments, at least, of every episode that a coherence is a mean over
-    lags: int = 25  # samples between residuals, and between residuals and inputs
-    white: float = 0.99  # probability that the correlation of a white residual is in its band
     concentrated: float = 0.8  # concentration below which the segments of a unit disagree on its phase
 
 

@@ -8,14 +8,12 @@ from itertools import compress
 import numpy as np
 
 from ...core import AnyArray, ConfigError
-from ...data import EpisodeKey, Population, Role, some
+from ...data import Population, Role, some
 from ...evaluate.errors import error_spectrum
-from ...evaluate.validation import excitation
 from ...identify import PhaseCalibration
 from ..canvas import (
     Captioned,
     Figure,
-    frequency_axis,
     grid,
     label_below,
     legend,
@@ -27,8 +25,7 @@ from ..canvas import (
 )
 from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
-from ..theme import DRAWING, HUES, Tone
-from .entries import short
+from ..theme import DRAWING, Tone
 from .episodes import draw_line, label_rows, references, steady_stretches
 
 _RECORDED, _REFERENCE = Look(Tone.INK), Look(Tone.GOLD, weight=3, opacity=0.5)
@@ -58,47 +55,19 @@ def signals(run: RunFolder) -> Captioned:
     return figure, "The same unit in two conditions." if len(shown) == 2 else ""
 
 
-def episodes_of(population: Population, unit: str | None, condition: str | None) -> tuple[EpisodeKey, ...]:
-    """Return the episodes of a unit in a condition, the first ones by default."""
+def population_figure(population: Population, unit: str | None = None, condition: str | None = None) -> Figure:
+    """Draw all channels of the first episode of a unit, inputs in gold."""
     keys = population.keys(unit, condition)
     if not keys:
         raise ConfigError("Plot: the population has no such episodes; see its unit_ids and conditions.")
-    return population.keys(keys[0].unit, keys[0].condition)
-
-
-def population_figure(population: Population, unit: str | None = None, condition: str | None = None) -> Figure:
-    """Draw all channels of the first episode of a unit, inputs in gold."""
-    key = episodes_of(population, unit, condition)[0]
-    values = population.read(key)
+    values = population.read(keys[0])
     figure, axes = grid(len(population.channels), 1, sharex=True)
     time_s = np.arange(len(values)) * population.sample_period_s
     for panel, channel, line in zip(axes[:, 0], population.channels, values.T, strict=True):
         draw_line(panel, time_s, line, _RECORDED if channel.role is Role.STATE else _REFERENCE, channel.name)
     label_rows(axes[:, 0], population.channels)
-    axes[0, 0].set_title(episode_title(key))
+    axes[0, 0].set_title(episode_title(keys[0]))
     label_below(axes[-1], "time (s)")
-    return figure
-
-
-def excitation_figure(population: Population, unit: str | None = None, condition: str | None = None) -> Figure:
-    """Draw spectra of the inputs and their coherence with every state, over the episodes of a unit."""
-    keys, states = episodes_of(population, unit, condition), len(population.states)
-    inputs = population.channels[states:][: DRAWING.states]
-    if not inputs:
-        raise ConfigError("Plot of the excitation: the population has no inputs; declare some.")
-    freqs, power, coherence = excitation(population, keys, DRAWING.segment, DRAWING.averages)
-    figure, axes = grid(len(inputs), 2, sharex=True)
-    for i, (channel, (left, right)) in enumerate(zip(inputs, axes, strict=True), states):
-        left.plot(freqs[1:], power[i, 1:], color=Tone.GOLD)
-        logarithmic(left)
-        left.set_ylabel(f"{short(channel.name)}\n({squared(channel.unit)}/Hz)")
-        for name, line, tone in zip(population.states, coherence[i], HUES, strict=False):
-            right.plot(freqs[1:], line[1:], color=tone, label=words(name))
-        right.set_ylim(0, 1.05)
-        frequency_axis(left, freqs)
-        frequency_axis(right, freqs)
-    set_titles(axes[0], (f"PSD, {len(keys)} episodes of unit {keys[0].unit}", "coherence with states"))
-    legend(axes[0, 1])
     return figure
 
 

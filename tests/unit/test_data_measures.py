@@ -174,8 +174,7 @@ def test_columns_that_state_unit_and_episode(tmp_path: Path) -> None:
         EpisodeKey(u, "default", e) for u, e in (("SN 7", "1"), ("SN 8", "1"), ("SN 8", "2"))
     )
     np.testing.assert_allclose(found.read(found.episodes[2])[:, 0], temperature[40:] + 273.15)
-    blocks = list(found.blocks(found.episodes[1], 7))
-    np.testing.assert_allclose(np.concatenate(blocks)[:, 0], temperature[20:40] + 273.15)
+    np.testing.assert_allclose(found.read(found.episodes[1])[:, 0], temperature[20:40] + 273.15)
     scattered = np.tile(["SN 7", "SN 8"], 30)
     write(tmp_path / "all.csv", "t [s],T [degC],i,serial,run", temperature, current, scattered, np.ones(N, int))
     with pytest.raises(DataError, match=r"Duplicate episodes: episode 1 of unit SN 7"):

@@ -117,7 +117,6 @@ def test_a_last_sample_of_the_same_stamp_is_dropped_however_often_it_is_written(
     found = read_csv_folder(tmp_path, MAPPING)
     for key in found.episodes:
         np.testing.assert_allclose(found.read(key), values, rtol=1e-12)
-        np.testing.assert_allclose(np.vstack(list(found.blocks(key, 30))), values, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["population", "outliers"])

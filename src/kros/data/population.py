@@ -269,11 +269,6 @@ class Population(Shown):
         channels = np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values
         return channels, values[:, n : n + len(self.truths)]
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
-        """Read one episode in blocks of at most `rows` samples, each of shape (n, n_channels), in as little memory."""
-        for values in self.source.blocks(key, rows):
-            yield values[:, : len(self.channels)]
-
     def read_parts(self, key: EpisodeKey) -> tuple[Array, Array]:
         """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""
         values = self.read(key)

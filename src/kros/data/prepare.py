@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
-from typing import ClassVar
 
 import numpy as np
 from pydantic import ValidationError
 
 from ..core import Array, ByName, ConfigError, DataError, frozen, shortened, united
 from .population import Channels, EpisodeKey, Population, Scalings, Unit, columns_in_order, natural_key
-from .recording import Recording, Recordings, check_even, check_period, check_structure, checked_blocks, estimate_period
+from .recording import Recording, Recordings, check_episode, check_even, check_period, check_structure, estimate_period
 from .steps import STEPS, Signals, Step
 
 HEAD = 100_000  # samples whose median step is the period
@@ -31,46 +30,17 @@ class PreparedSource:
 
     def __call__(self, key: EpisodeKey) -> Array:
         """Return one prepared episode, shape (n_samples, n_channels)."""
-        (values,) = self._checked(key, [self.recordings(key)])
-        return values
-
-    def _check_time(self, recording: Recording) -> None:
-        """Refuse uneven time, unless a step makes it even."""
+        recording, signals = self.recordings(key), Signals(self.channels, self.period_s)
         if not any(step.makes_even for step in self.steps):
-            file = self.recordings.file(self.recordings.places[recording.key])
+            file = self.recordings.file(self.recordings.places[key])
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
-
-    def _prepared(self, recording: Recording) -> Array:
-        """Return what steps make of an episode, or of a part of it."""
-        signals = Signals(self.channels, self.period_s)
-        # A running observer has to see that a sample is missing; training does not.
-        if not self.gaps and any(step.makes_even for step in self.steps):
+        elif not self.gaps:  # a running observer has to see that a sample is missing; training does not
             recording = recording.usable(self.period_s)
         for step in self.steps:
             recording = step.apply(recording, signals.channels, signals.period_s)
             signals = step.describe(signals)
+        check_episode(recording.values, key, signals.channels, self.gaps)
         return recording.values
-
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
-        """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
-        if all(step.samplewise for step in self.steps):
-            return self._checked(key, self.recordings.blocks(key, rows))
-        values = self(key)
-        return (values[k : k + rows] for k in range(0, len(values), rows))
-
-    def _checked(self, key: EpisodeKey, blocks: Iterable[Recording]) -> Iterator[Array]:
-        """Return blocks of an episode after their steps, none of them empty, checked."""
-        channels = described(Signals(self.channels, self.period_s), self.steps).channels
-        return checked_blocks(self._in_turn(blocks), key, channels, gaps=self.gaps)
-
-    def _in_turn(self, blocks: Iterable[Recording]) -> Iterator[Array]:
-        """Yield blocks of an episode after their steps; time is checked from the sample before on."""
-        end = np.empty(0)
-        for block in blocks:
-            if block.time_s is not None:
-                self._check_time(replace(block, time_s=np.append(end, block.time_s)))
-                end = block.time_s[-1:]
-            yield self._prepared(block)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> PreparedSource:
         """Return the same for fewer episodes."""
@@ -115,7 +85,7 @@ def _first_period(recordings: Recordings, episodes: Sequence[EpisodeKey]) -> tup
     """Return the sampling period of the first episode whose beginning can be read, and this episode."""
     for key in episodes:
         with suppress(DataError):
-            return estimate_period(next(recordings.blocks(key, HEAD))), key
+            return estimate_period(recordings(key).cut(0, HEAD)), key
     return estimate_period(recordings(episodes[0])), episodes[0]  # says why not
 
 
@@ -184,7 +154,6 @@ class _Divide(Step):
     """Divide columns by sizes."""
 
     sizes: tuple[float, ...]
-    samplewise: ClassVar[bool] = True
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording in the sizes."""

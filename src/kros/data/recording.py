@@ -80,7 +80,7 @@ class Recording:
 
 @frozen
 class Recordings:
-    """Episodes of a reader, read one at a time; a format overrides `blocks`. Can be pickled when `places` can."""
+    """Episodes of a reader, read one at a time; a format has its own `read`. Can be pickled when `places` can."""
 
     places: Mapping[EpisodeKey, Any]  # where each episode is
 
@@ -89,11 +89,10 @@ class Recordings:
         if key not in self.places:
             others = f"this source has {len(self.places)} other episodes"
             raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
-        (recording,) = self.blocks(key)
-        return recording.distinct().ended()
+        return self.read(key).distinct().ended()
 
-    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
-        """Yield one episode as recorded, in blocks of about `rows` samples where the format can, else whole."""
+    def read(self, key: EpisodeKey) -> Recording:
+        """Return one episode as recorded."""
         raise NotImplementedError
 
     def file(self, place: Any) -> Path | None:
@@ -179,40 +178,28 @@ class NonFiniteError(DataError):
     """An episode holds NaN or infinity."""
 
 
-def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel]) -> None:
+def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], gaps: bool = False) -> None:
     """Check one episode's samples: shape, length, numbers, and that no state stands still while others move."""
-    for _ in checked_blocks([values], key, channels, gaps=False):
-        pass
-
-
-def checked_blocks(parts: Iterable[Array], key: EpisodeKey, channels: Sequence[Channel], gaps: bool) -> Iterator[Array]:
-    """Give the blocks of one episode, none of them empty, on, and check them as `check_episode` does."""
-    count, first, resting = 0, np.empty(0), np.ones(len(channels), dtype=bool)
-    for values in parts:
-        if values.ndim != 2 or values.shape[1] != len(channels):
-            declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
-            raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
-        if not gaps and count + len(values) >= CHECK.samples and not usable(values).all():
-            check_finite(values, key, channels, first=count)
-        first = first if count else values[:1].ravel()
-        resting &= [r and len(values) > 0 and is_constant(values[:, i], first[i]) for i, r in enumerate(resting)]
-        count += len(values)
-        if len(values):
-            yield values
-    if count < CHECK.samples:
-        need = f"at least {CHECK.samples} samples are needed, found {count}"
+    if values.ndim != 2 or values.shape[1] != len(channels):
+        declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
+        raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
+    if len(values) < CHECK.samples:
+        need = f"at least {CHECK.samples} samples are needed, found {len(values)}"
         raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
+    if not gaps and not usable(values).all():
+        check_finite(values, key, channels, first=0)
+    resting = [is_constant(signal) for signal in values.T]
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and resting[i]]
     moving = [c.name for i, c in enumerate(channels) if still and not resting[i]]
     if moving:
-        stays = f"state {channels[still[0]].name!r} stays at {first[still[0]]:g} in all {count} samples"
+        stays = f"state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples"
         reason = f"while {', '.join(map(repr, moving))} move, so its sensor is stuck or the column is wrong"
         raise DataError(f"{title(key)}: {stays} {reason}; leave the episode out, or the channel.")
 
 
-def is_constant(column: Array, first: float | None = None) -> bool:
+def is_constant(column: Array) -> bool:
     """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
-    first = column[0] if first is None else first
+    first = column[0]
     if not np.isfinite(first):
         return False
     room = CHECK.constant * abs(first)

@@ -70,7 +70,6 @@ class Step:
 
     step: ClassVar[str] = ""
     makes_even: ClassVar[bool] = False
-    samplewise: ClassVar[bool] = False  # whether every sample is prepared by itself
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     @property
@@ -118,7 +117,6 @@ class Scale(Step):
     unit: str | None = None
     offset: float = 0.0
     step: ClassVar[str] = "scale"
-    samplewise: ClassVar[bool] = True
 
     def describe(self, signals: Signals) -> Signals:
         """Return the signals with channels multiplied and their new unit of measure."""

@@ -31,7 +31,7 @@ from ..data import EpisodeKey, Population, split_episodes
 from .survey import RecordingFacts
 
 log = logging.getLogger(__name__)
-_BLOCK = 100_000  # samples of one recording in memory
+_BLOCK = 100_000  # samples of one recording at once
 
 
 @dataclass(frozen=True)
@@ -225,12 +225,13 @@ def _mark(facts: RecordingFacts, task: Task) -> str:
 
 
 def segments_of(task: Task) -> list[Segment]:
-    """Find the constant-velocity segments of some episodes, each read in blocks where it is very long."""
+    """Find the constant-velocity segments of some episodes, in blocks where one is very long."""
     population, keys, spec = task
     names = population.states + population.inputs
     angle, reference = (names.index(n) for n in (spec.angle, spec.reference))
     segments, dt = [], population.sample_period_s
-    for values in (block for key in keys for block in population.blocks(key, _BLOCK) if len(block) > 1):
+    whole = map(population.read, keys)
+    for values in (block for one in whole for k in range(0, len(one), _BLOCK) if len(block := one[k : k + _BLOCK]) > 1):
         rate = values[:, names.index(spec.measured)] if spec.measured in names else np.gradient(values[:, angle], dt)
         segments += find_segments(values[:, angle], values[:, reference], rate, dt, spec)
     return segments

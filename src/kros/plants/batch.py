@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -49,9 +49,9 @@ class SimulatedPopulation(Generic[T]):
 class SimulatedEpisodes(Recordings):
     """Raw episodes in memory, (n, n_samples) a part: states, inputs, what states really were."""
 
-    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
-        """Yield an episode."""
-        yield Recording(key, np.ascontiguousarray(np.concatenate(self.places[key]).T))
+    def read(self, key: EpisodeKey) -> Recording:
+        """Return an episode."""
+        return Recording(key, np.ascontiguousarray(np.concatenate(self.places[key]).T))
 
 
 @dataclass(frozen=True)

@@ -157,11 +157,11 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColum
         if len(samples) == len(spread):
             break
         with suppress(DataError):
-            (values,) = table.numbers(places)
+            values = table.numbers(places)
             if len(values) >= CHECK.samples:
                 samples[table] = np.where(usable(values), values, np.nan).T
     if not samples:
-        next(tables[0].numbers(places))  # says why not, where it cannot be read
+        tables[0].numbers(places)  # says why not, where it cannot be read
         problem = "the files have fewer than three rows of numbers; check the folder."
         raise DataError(f"Looking at {source}: {problem}")
     return next(iter(samples)), {at: [signals[i] for signals in samples.values()] for i, at in enumerate(places)}

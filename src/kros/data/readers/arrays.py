@@ -22,9 +22,9 @@ class ArrayRecordings(Recordings):
         for values, _ in self.places.values():
             values.flags.writeable = False
 
-    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
-        """Yield one episode."""
-        yield Recording(key, *self.places[key])
+    def read(self, key: EpisodeKey) -> Recording:
+        """Return one episode."""
+        return Recording(key, *self.places[key])
 
 
 def declare_channels(

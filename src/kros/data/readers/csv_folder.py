@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
-from ...core import Array, ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
+from ...core import ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
 from ..measures import clean_unit, measure, split_header
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps
@@ -223,32 +223,17 @@ class CsvRecordings(Recordings):
         """Return the file of an episode."""
         return place.table.path
 
-    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
-        """Yield one episode in blocks, unless it is a part of a file."""
+    def read(self, key: EpisodeKey) -> Recording:
+        """Return samples in declared units, with time, the first column if there is one, since the first sample."""
         place = self.places[key]
-        first, last, waiting = np.empty(0), np.empty((0, len(place.wanted))), list[Recording]()
-        for values in self._values(place, rows):
-            yield from waiting
-            first = first if first.size else values[:1]
-            joined, n, last = np.vstack([last, values]), len(last), values[-1:]
-            waiting = [self._recording(key, joined, first).distinct().cut(n, len(joined))]
-        yield waiting[0].ended()
-
-    def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
-        """Yield the columns of a file in blocks."""
-        (i, n), whole = place.piece, (place.piece, place.rows) == ((0, 1), slice(None))
-        for values in place.table.numbers(place.wanted, self.timestamp, rows if whole else np.inf):
-            values = values[place.rows]
-            yield values[i * len(values) // n : (i + 1) * len(values) // n]
-
-    def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
-        """Return samples in declared units, with time, the first column if there is one, since the `first` sample."""
-        factors, offsets = np.transpose(self.places[key].scales)
+        (i, n), values = place.piece, place.table.numbers(place.wanted, self.timestamp)[place.rows]
+        values = values[i * len(values) // n : (i + 1) * len(values) // n]
+        factors, offsets = np.transpose(place.scales)
         if self.time_scale is None:
             return Recording(key, values * factors + offsets)
         scale = factors[0] * (self.time_scale if self.timestamp is None else TIMESTAMP_SCALE)
-        time, start = (np.where(usable(t), t, np.nan) for t in (values[:, 0], first[:, 0]))
-        since = time - start  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
+        time = np.where(usable(values[:, 0]), values[:, 0], np.nan)
+        since = time - time[:1]  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
         return Recording(key, values[:, 1:] * factors[1:] + offsets[1:], since * scale)
 
 
@@ -330,7 +315,7 @@ def _stretches(table: Table, mapping: CsvMapping) -> Iterator[tuple[dict[str, st
         return
     columns = [table.texts(_position(table, c)) for c in labels.values()]
     if trigger is not None:
-        (values,) = table.numbers([_position(table, trigger)])
+        values = table.numbers([_position(table, trigger)])
         columns.append((values[:, 0] > mapping.threshold).tolist())
     counts = Counter[Any]()
     for state, rows in stretches(columns):

@@ -26,7 +26,7 @@ from ...core.files import draft_beside, pass_on_shortage, require_regular, short
 from ..population import Channels, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_structure, refuse_copies, usable_episodes
-from .tables import BLOCK, from_numpy, repeated, to_numpy
+from .tables import from_numpy, repeated, to_numpy
 
 Place = tuple[str, int, int]
 Episodes = Iterable[tuple[EpisodeKey, Array, str]]  # usable ones, with their samples and digests
@@ -50,17 +50,17 @@ class ParquetRecordings(Recordings):
         """Return the file of a unit and condition."""
         return Path(self.folder) / place[0]
 
-    def blocks(self, key: EpisodeKey, rows: float = np.inf) -> Iterator[Recording]:
-        """Yield an episode whole, or in blocks of at most `rows` samples."""
+    def read(self, key: EpisodeKey) -> Recording:
+        """Return an episode."""
         place = self.places[key]
         path = self.file(place)
         require_regular(path, sys.maxsize)
         try:
-            for table in _tables(path, place, [*KEYS, *self.columns], rows):
-                table.select(KEYS).validate(full=True)
-                if [table.column(name).unique().to_pylist() for name in KEYS] != [[name] for name in astuple(key)]:
-                    raise DataError(f"Reading {path}: the index says {key}, the samples do not; {AGAIN}.")
-                yield Recording(key, np.column_stack([to_numpy(table.column(channel)) for channel in self.columns]))
+            table = _table(path, place, [*KEYS, *self.columns])
+            table.select(KEYS).validate(full=True)
+            if [table.column(name).unique().to_pylist() for name in KEYS] != [[name] for name in astuple(key)]:
+                raise DataError(f"Reading {path}: the index says {key}, the samples do not; {AGAIN}.")
+            return Recording(key, np.column_stack([to_numpy(table.column(channel)) for channel in self.columns]))
         except DataError:
             raise
         except _ARROW_ERRORS as error:
@@ -68,14 +68,12 @@ class ParquetRecordings(Recordings):
             raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; {AGAIN}.") from error
 
 
-def _tables(path: Path, place: Place, columns: list[str], rows: float) -> Iterator[Any]:
-    """Yield columns of a row group after checks of length and types, pages against their checksums."""
-    import pyarrow as pa
+def _table(path: Path, place: Place, columns: list[str]) -> Any:
+    """Return columns of a row group after checks of length and types, pages against their checksums."""
     from pyarrow import parquet
 
     _, group, samples = place
-    options: Record = {"pre_buffer": False, "page_checksum_verification": True}
-    options |= {"memory_map": True} if rows == np.inf else {"buffer_size": BLOCK}
+    options: Record = {"pre_buffer": False, "page_checksum_verification": True, "memory_map": True}
     with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:
         actual, schema = file.metadata.row_group(group).num_rows, file.schema_arrow
         if actual != samples:
@@ -86,11 +84,7 @@ def _tables(path: Path, place: Place, columns: list[str], rows: float) -> Iterat
         if wrong:
             problem = f"column {wrong[0]!r} should hold {'text' if wrong[0] in KEYS else 'numbers of type double'}"
             raise DataError(f"Reading {path}: {problem}, found {kinds[wrong[0]]}; files were changed, {AGAIN}.")
-        if rows == np.inf:
-            yield file.read_row_group(group, columns=columns, use_threads=False)
-            return
-        for part in file.iter_batches(int(rows), row_groups=[group], columns=columns, use_threads=False):
-            yield pa.Table.from_batches([part])
+        return file.read_row_group(group, columns=columns, use_threads=False)
 
 
 @lru_cache

@@ -1,4 +1,4 @@
-"""Numbers from one table of text, fast, in bounded memory, with errors that name the file and the column."""
+"""Numbers from one table of text, fast, with errors that name the file and the column."""
 
 from __future__ import annotations
 
@@ -60,20 +60,15 @@ class Table:
         fields, units = _columns(path, dialect)
         return cls(path, dialect, tuple(fields), tuple(map(clean_unit, units)))
 
-    def numbers(self, columns: Sequence[int], timestamp: str | None = None, rows: float = np.inf) -> Iterator[Array]:
-        """Yield some columns in blocks of at least `rows`; the first may be timestamps, as microseconds."""
+    def numbers(self, columns: Sequence[int], timestamp: str | None = None) -> Array:
+        """Return some columns; the first may be timestamps, as microseconds."""
         if is_binary(self.path):
-            yield values_of(self.path, [self.fields[i] for i in columns])
-            return
-        waiting = [np.empty((0, len(columns)))]
+            return values_of(self.path, [self.fields[i] for i in columns])
+        parts = [np.empty((0, len(columns)))]
         for time, *others in self._batches(columns, () if timestamp is None else columns[:1]):
             first = to_numpy(time) if timestamp is None else microseconds(time, timestamp)
-            part = np.column_stack([first, *map(to_numpy, others)])
-            if len(part) > 1 and sum(map(len, waiting)) >= rows:
-                yield np.concatenate(waiting)
-                waiting = []
-            waiting.append(part)
-        yield np.concatenate(waiting)
+            parts.append(np.column_stack([first, *map(to_numpy, others)]))
+        return np.concatenate(parts)
 
     def texts(self, column: int) -> list[str]:
         """Return a column as text."""

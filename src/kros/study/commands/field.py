@@ -27,7 +27,6 @@ from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
 from ...identify.calibration import Texts, Values, unit_values
 from ...observer import Observer, SampleStatus
-from ...observer.sensor import delay_of
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import Stage, StudyConfig, validate_config
@@ -181,7 +180,7 @@ class FieldRecordings:
         chosen, values = dict[EpisodeKey, Array](), self.values[unit]
         for key in self.population.keys(unit)[:_BATCH]:
             if sum(map(len, chosen.values())) < _BLOCK:
-                chosen[key] = next(self.population.blocks(key, _BLOCK))
+                chosen[key] = self.population.read(key)[:_BLOCK]
         arrived = arriving(self.observer, self.population, chosen, {unit: values})
         step, known = 2 * np.pi / _PHASES, {**self.observer.parameters, **values}
         signals = (self.observer, arrived.y, arrived.u, arrived.lengths, known, name)
@@ -193,22 +192,20 @@ class FieldRecordings:
         return arriving(self.observer, self.population, {key: self.population.read(key)}, self.values)
 
     def estimates(self) -> Iterator[Estimated]:
-        """Run the observer over all episodes, every block behind the samples that late measurements are read from."""
-        observer, late = self.observer, delay_of(self.observer.sensor)
+        """Run the observer over all episodes, block after block."""
+        observer = self.observer
         for key in self.population.episodes:
-            start, course = 0, None
+            recorded = self.population.read(key)
+            arrived = arriving(observer, self.population, {key: recorded}, self.values)
             loop = None if self.name is None else PhaseLockedLoop(observer, self.name, 1)
-            before = np.empty((0, len(self.population.channels)))
-            for block in self.population.blocks(key, _BLOCK):
-                values, lead = np.concatenate([before, block]), len(before)
-                arrived = arriving(observer, self.population, {key: values}, self.values)
-                course = course or Course(observer, 1, arrived.parameters, loop)
-                run = course.take(arrived.y[lead:], arrived.u[lead:])
+            course = Course(observer, 1, arrived.parameters, loop)
+            for start in range(0, len(recorded), _BLOCK):
+                block = slice(start, start + _BLOCK)
+                run = course.take(arrived.y[block], arrived.u[block])
                 columns = run.estimates[:, 0, : len(observer.recorded)]
                 if loop is not None:
                     columns = np.column_stack([columns, np.broadcast_to(run.followed, run.status.shape)[:, 0]])
-                yield key, start, columns, run.status[:, 0], block
-                start, before = start + len(block), values[max(0, len(values) - late) :]
+                yield key, start, columns, run.status[:, 0], recorded[block]
 
 
 def status_counts(status: Bits) -> Counter[str]:

@@ -1,4 +1,4 @@
-"""Units of measure in headers and files, and episodes that columns and triggers cut out of a file."""
+"""Units of measure in headers and files, and episodes that columns cut out of a file."""
 
 from __future__ import annotations
 
@@ -181,20 +181,6 @@ def test_columns_that_state_unit_and_episode(tmp_path: Path) -> None:
         read_csv_folder(tmp_path, MAPPING | {"files": "all", "labels": {"unit": "serial", "episode": "run"}})
     with pytest.raises(ConfigError, match="labels"):
         read_csv_folder(tmp_path, MAPPING | {"labels": {"machine": "serial"}})
-
-
-def test_every_stretch_above_a_trigger_is_an_episode(tmp_path: Path) -> None:
-    temperature, current = signals(0)
-    enable = np.repeat([0, 5, 0.5, 5, 0, 5], 10)
-    write(tmp_path / "a_3.csv", "t [s],T [degC],i,enable", temperature, current, enable)
-    table = MAPPING | {"trigger": "enable", "threshold": 1.0}
-    found = read_csv_folder(tmp_path, table)
-    assert [k.episode for k in found.episodes] == ["3.1", "3.2", "3.3"]
-    np.testing.assert_allclose(found.read(found.episodes[1])[:, 1], 1e-3 * current[30:40])
-    with pytest.raises(DataError, match="column 'enable' is nowhere above 9; lower"):
-        read_csv_folder(tmp_path, MAPPING | {"trigger": "enable", "threshold": 9.0})
-    with pytest.raises(DataError, match="column 'armed' is missing"):
-        read_csv_folder(tmp_path, MAPPING | {"trigger": "armed"})
 
 
 @pytest.mark.parametrize(("header", "unit"), [("time_min", "min"), ("t_h", "h"), ("Zeit_min", "min"), ("x_min", "")])

@@ -6,11 +6,10 @@ import codecs
 import logging
 import os
 import re
-from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
@@ -75,10 +74,6 @@ class CsvMapping(Dialect):
     labels: dict[Literal["unit", "condition", "episode"], Column] = Field(
         {}, description='columns that state what a row belongs to, for example `{unit = "serial"}`'
     )
-    trigger: Column | None = Field(
-        None, description="every stretch of rows with this column above `threshold` is an episode, `<episode>.1` ..."
-    )
-    threshold: float = Field(0.5, description="of the trigger; the default is for a flag of 0 and 1")
     prepare: tuple[Record | Step, ...] = Field((), description="preparation steps of this mapping")
     metadata: Record = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
 
@@ -137,7 +132,7 @@ class CsvMapping(Dialect):
     def declared(self) -> tuple[Column | None, ...]:
         """All columns that it names; of time none where there is no such column."""
         columns = (self.column(c, u) for u in self.units for c in self.channel)
-        return (self.time, self.trigger, *self.labels.values(), *columns)
+        return (self.time, *self.labels.values(), *columns)
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
@@ -298,34 +293,15 @@ def _episodes(
 ) -> Iterator[tuple[EpisodeKey, FilePlace]]:
     """Yield the episodes of a file, of which its name says some parts; `known` are units of measure of other files."""
     places = [(unit.suffix, _places(table, mapping, unit, known)) for unit in mapping.units]
-    for labels, number, rows in _stretches(table, mapping):
+    columns = [table.texts(_position(table, column)) for column in mapping.labels.values()]
+    for state, rows in stretches(columns) if columns else [((), slice(None))]:
+        labels = dict(zip(mapping.labels, state, strict=True))
         parts = {"unit": "unit", "condition": DEFAULT_CONDITION, "episode": "0", **named, **labels}
         for suffix, place in places:
             for i in range(mapping.pieces):
-                episode = parts["episode"] + number + (f".{i + 1}" if mapping.pieces > 1 else "")
+                episode = parts["episode"] + (f".{i + 1}" if mapping.pieces > 1 else "")
                 key = EpisodeKey(parts["unit"] + suffix, parts["condition"], episode)
                 yield key, FilePlace(table, *place, rows, (i, mapping.pieces))
-
-
-def _stretches(table: Table, mapping: CsvMapping) -> Iterator[tuple[dict[str, str], str, slice]]:
-    """Yield what columns state of every episode in a file, its number and its rows."""
-    labels, trigger = mapping.labels, mapping.trigger
-    if not labels and trigger is None:
-        yield {}, "", slice(None)
-        return
-    columns = [table.texts(_position(table, c)) for c in labels.values()]
-    if trigger is not None:
-        values = table.numbers([_position(table, trigger)])
-        columns.append((values[:, 0] > mapping.threshold).tolist())
-    counts = Counter[Any]()
-    for state, rows in stretches(columns):
-        counts[state] += 1
-        if trigger is None or state[-1]:
-            number = "" if trigger is None else f".{counts[state]}"
-            yield dict(zip(labels, state, strict=False)), number, rows
-    if trigger is not None and not any(state[-1] for state in counts):
-        problem = f"column {trigger!r} is nowhere above {mapping.threshold:g}"
-        raise DataError(f"Reading {table.path}: {problem}; lower the threshold, or exclude the file.")
 
 
 def _absent(mapping: CsvMapping, fields: Names, optional: Collection[str]) -> set[str]:

@@ -43,7 +43,9 @@ Recordings = dict[str, dict[str, np.ndarray]]
 
 def read(folder: Path, spikes: bool) -> Recordings:
     """Return episodes by build, columns q1 q2 w1 w2 held1 held2 command1 command2, 400 samples a second."""
-    population = kros.read(folder, mapping=Path(__file__).parent / "builds.toml")
+    # 800 samples a second are more than were recorded, so this only interpolates; every second one is kept
+    even = kros.data.steps.Resample(0.00125)
+    population = kros.read(folder, mapping=Path(__file__).parent / "builds.toml", prepare=[even])
     found: Recordings = {}
     for key in population.episodes:
         if spikes or key.episode not in SPIKES.get(key.unit, ()):

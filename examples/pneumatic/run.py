@@ -16,6 +16,7 @@ import numpy as np
 
 from kros.cli import app
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, read, write_parquet
+from kros.data.steps import Resample
 
 PIECES, PIECE, TRAINING, STEPS_BACK = 10, 310, 0.7, 5
 CREEP_MM_S = 0.5
@@ -39,7 +40,8 @@ if __name__ == "__main__":
     here = Path(__file__).parent
     if "KROS_DATA" not in os.environ:
         sys.exit("Set KROS_DATA to the folder that holds pneumatic_cc0; study.toml says where it is published.")
-    recordings = read(Path(os.environ["KROS_DATA"]) / "pneumatic_cc0", mapping=here / "recordings.toml")
+    even = Resample(0.02, max_gap_s=3.0)  # half the steps are a little longer than 10 ms; one recording rests for 2.7 s
+    recordings = read(Path(os.environ["KROS_DATA"]) / "pneumatic_cc0", mapping=here / "recordings.toml", prepare=[even])
     with tempfile.TemporaryDirectory() as folder:
         write_parquet(prepared(recordings), Path(folder) / "recordings")
         source = f"data.source={Path(folder) / 'recordings'}"

@@ -32,11 +32,11 @@ MAPPING: dict[str, Any] = {
         {"name": "angle", "column": 2, "role": "state", "unit": "rad", "measured": True, "scale": np.pi / 180},
         {"name": "voltage", "column": "U", "role": "input", "unit": "V"},
     ],
-    "prepare": [
-        {"step": "shift", "channels": ["voltage"], "lag": 2},
-        {"step": "offset", "channel": "angle", "reference": "current", "start": 0, "stop": 1},
-    ],
 }
+PREPARE = [
+    {"step": "shift", "channels": ["voltage"], "lag": 2},
+    {"step": "offset", "channel": "angle", "reference": "current", "start": 0, "stop": 1},
+]
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,9 @@ def found(tmp_path_factory) -> tuple[Any, dict[str, Any]]:
         "observer": {"baselines": []},
         "sensor": {"angle": {"noise": 1e-4}},
     }
-    study = kros.run(kros.read(folder / "rec", mapping=MAPPING), folder / "run", until="synthesize", **quick)
+    study = kros.run(
+        kros.read(folder / "rec", mapping=MAPPING, prepare=PREPARE), folder / "run", until="synthesize", **quick
+    )
     return study, json.loads((study.folder / "observers" / "deployed.json").read_text())
 
 
@@ -117,6 +119,10 @@ FIELD = """
 [data]
 source = "rec"
 reader = "csv"
+prepare = [
+    {step = "shift", channels = ["voltage"], lag = 2},
+    {step = "offset", channel = "angle", reference = "current", start = 0, stop = 1},
+]
 
 [data.csv]
 files = '(?P<unit>\\w+)_(?P<episode>\\d+)[.]csv'
@@ -125,10 +131,6 @@ channel = [
     {name = "current", column = "I (mA)", role = "state", unit = "A", scale = 1e-3},
     {name = "angle", column = 2, role = "state", unit = "rad", measured = true, scale = 0.017453292519943295},
     {name = "voltage", column = "U", role = "input", unit = "V"},
-]
-prepare = [
-    {step = "shift", channels = ["voltage"], lag = 2},
-    {step = "offset", channel = "angle", reference = "current", start = 0, stop = 1},
 ]
 """
 

@@ -129,7 +129,7 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
     )
     assert kros("run", study, "--out", tmp_path / "run", "--until", "read").exit_code == 0
     for change, message in (
-        ("threshold=nan", "CSV mapping: threshold: input should be a finite number, found nan."),
+        ("time_scale=nan", "data.csv.time_scale: input should be a finite number, found nan"),
         ("encoding=utf-16", "its first lines are not UTF-16 (UTF-16 stream does not start with BOM)"),
         ("pieces=100000", "pieces: input should be less than or equal to 1000, found 100000"),
     ):

@@ -179,7 +179,6 @@ def test_another_rate(folder: Path) -> None:
             {"unit": [{"suffix": "1", "columns": {"z": "pos"}}]},
             r"gives a column for 'z'; the channels are \['u', 'x'\]",
         ),
-        ({"prepare": [{"step": "trim", "begin": 1}]}, "begin: unexpected keyword argument"),
     ],
 )
 def test_mapping_refuses(folder: Path, changes: dict[str, Any], message: str) -> None:

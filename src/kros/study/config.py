@@ -8,10 +8,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, TypeAdapter, field_validator
 
 from ..core import ConfigError, Names, Record, Settings, read_toml, shortened
-from ..data.readers.csv_folder import mapping_schema
+from ..data.readers.csv_folder import CsvMapping
+from ..data.steps import STEPS
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
 from ..observer import EstimatorSettings, Sensor
@@ -51,7 +52,7 @@ class DataConfig(Settings):
         "error", description="what an episode with a missing value is: an error, or left out"
     )
     prepare: tuple[Record, ...] = Field((), description="preparation steps, in order")
-    csv: Record | None = Field(None, description="the mapping, for the reader csv")
+    csv: CsvMapping | None = Field(None, description="the mapping, for the reader csv")
 
     @field_validator("source")
     @classmethod
@@ -169,11 +170,14 @@ def validate_config(raw: Record, base: Path, origin: str = "study", overrides: S
 
 
 def study_schema() -> Record:
-    """Return the JSON schema of a study file, with the mapping of recordings and the preparation steps."""
-    schema, mapping = StudyConfig.model_json_schema(), mapping_schema()
-    schema["$defs"] |= {**mapping.pop("$defs"), "CsvMapping": mapping}
-    parts = {"csv": {"$ref": "#/$defs/CsvMapping"}, "prepare": mapping["properties"]["prepare"]}
-    schema["$defs"]["DataConfig"]["properties"] |= parts
+    """Return the JSON schema of a study file, with all preparation steps."""
+    schema, steps = (
+        StudyConfig.model_json_schema(),
+        {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()},
+    )
+    for name, step in steps.items():
+        step["properties"]["step"] = {"const": name}
+    schema["$defs"]["DataConfig"]["properties"]["prepare"]["items"] = {"oneOf": list(steps.values())}
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, field_validator, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from ...core import ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
 from ..measures import clean_unit, measure, split_header
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
-from ..prepare import assemble, parse_steps
+from ..prepare import assemble
 from ..recording import Recording, Recordings, some, usable
-from ..steps import STEPS, Scale, Step
+from ..steps import Scale, Step
 from .formats import FORMATS
 from .tables import TIMESTAMP_SCALE, Dialect, Table, stretches
 
@@ -29,6 +29,8 @@ GROUPS = ("unit", "condition", "episode", "group")
 
 class ChannelMapping(Settings):
     """``[[channel]]``: a channel and the column it is read from."""
+
+    model_config = ConfigDict(populate_by_name=True)
 
     name: str = Field(description="of the channel, in everything that follows")
     role: Role = Field(description="what it is to the observer; a truth serves evaluation alone")
@@ -51,8 +53,6 @@ class UnitMapping(Settings):
 class CsvMapping(Dialect):
     r"""How a folder of tables maps to a population; a file that does not match `files` is left alone."""
 
-    model_config = ConfigDict(arbitrary_types_allowed=True)
-
     files: str = Field(
         description="regular expression searched in the path relative to the folder (with `/`); the named groups "
         "`unit`, `condition`, `episode` and `group` say what a file is, a missing one gets a default"
@@ -74,7 +74,6 @@ class CsvMapping(Dialect):
     labels: dict[Literal["unit", "condition", "episode"], Column] = Field(
         {}, description='columns that state what a row belongs to, for example `{unit = "serial"}`'
     )
-    prepare: tuple[Record | Step, ...] = Field((), description="preparation steps of this mapping")
     metadata: Record = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")
 
     @field_validator("files", "exclude")
@@ -141,9 +140,9 @@ class CsvMapping(Dialect):
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """Scaling as declared per channel, then the mapping's own steps."""
-        scales = (Scale((c.name,), c.scale, offset=c.offset) for c in self.ordered if (c.scale, c.offset) != (1, 0))
-        return (*scales, *parse_steps(self.prepare, "CSV mapping: prepare"))
+        """Scaling as declared per channel."""
+        scaled = (c for c in self.ordered if (c.scale, c.offset) != (1, 0))
+        return tuple(Scale((c.name,), c.scale, offset=c.offset) for c in scaled)
 
     @property
     def scaling(self) -> dict[str, Scaling]:
@@ -162,10 +161,7 @@ class CsvMapping(Dialect):
 
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""
-        steps = [step.without(names) for step in parse_steps(self.prepare, "CSV mapping: prepare")]
-        channels = tuple(c for c in self.channel if c.name not in names)
-        prepare = tuple(step for step in steps if step is not None)
-        return self.model_copy(update={"channel": channels, "prepare": prepare})
+        return self.model_copy(update={"channel": tuple(c for c in self.channel if c.name not in names)})
 
 
 def _is_mark(text: str) -> bool:
@@ -179,16 +175,6 @@ def load_mapping(mapping: CsvMapping | ByName | Path | str) -> CsvMapping:
     if isinstance(mapping, Mapping):
         return CsvMapping.of(mapping, "CSV mapping")
     return CsvMapping.of(read_toml(Path(mapping), "CSV mapping"), f"CSV mapping {mapping}")
-
-
-def mapping_schema() -> Record:
-    """Return the JSON schema of a mapping, with all preparation steps."""
-    schema = CsvMapping.model_json_schema()
-    steps = {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()}
-    for name, step in steps.items():
-        step["properties"]["step"] = {"const": name}
-    schema["properties"]["prepare"]["items"] = {"oneOf": list(steps.values())}
-    return schema
 
 
 log = logging.getLogger(__name__)

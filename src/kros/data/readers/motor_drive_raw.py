@@ -17,6 +17,7 @@ import numpy as np
 
 from ...core import DataError, whole_folder
 from ..population import OUTLIERS, Channel, Population, Role
+from ..prepare import prepare
 from ..steps import Offset, Scale, Shift, Step, Trim
 from .csv_folder import ChannelMapping, CsvMapping, csv_files, read_csv_folder
 from .tables import from_numpy
@@ -50,7 +51,6 @@ MAPPING = CsvMapping(
     files=f"^(?P<group>{'|'.join(GROUPS)})/{FOLDER}/{EPISODE}$",
     time=1,
     channel=tuple(ChannelMapping(**vars(c), column=number) for number, c in enumerate(CHANNELS, start=2)),
-    prepare=STEPS,
     metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
 )
 
@@ -85,7 +85,9 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     population = read_csv_folder(root, MAPPING)
     steps = ((scale, population.sample_period_s * scale) for scale in (1e-3, 1e-6))
     scale = next((scale for scale, step in steps if math.isclose(step, PERIOD_S, rel_tol=0.01)), None)
-    return population if scale is None else read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
+    if scale is not None:
+        population = read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
+    return prepare(population, STEPS)
 
 
 def write_raw(population: Population, out: Path | str) -> None:

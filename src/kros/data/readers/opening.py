@@ -45,7 +45,7 @@ def read(
     mapping : CsvMapping, mapping or Path, optional
         How CSV files map to a population: a TOML file or the table ``[data.csv]``.
     prepare : iterable of Step or mapping
-        Further steps, as in ``[[data.prepare]]``, after those of the mapping.
+        Steps, as in ``[[data.prepare]]``, after those of the reader.
     optional : collection of str
         Channels that recordings may lack, such as states that only a test bench measures; steps that need them are
         left out with them.

@@ -247,10 +247,10 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a population with one badly assembled drive and run the whole study on it."""
-    from .study.commands.demo import Simulation, run_demo
+    from .study.commands.demo import run_demo
 
-    simulation = Simulation(units, episodes, seconds, seed)
-    _finish(run_demo(out, simulation, _count(workers), _progress(quiet), set_ or ()), quiet)
+    settings = {"n_units": units, "n_episodes": episodes, "seconds": seconds, "seed": seed, "outlier": True}
+    _finish(run_demo(out, settings, _count(workers), _progress(quiet), set_ or ()), quiet)
 
 
 @app.command()
@@ -265,9 +265,10 @@ def simulate(
     format_: Annotated[str, _option("parquet or raw, the paper's layout.", "--format")] = "parquet",
 ) -> None:
     """Simulate a population with known truth."""
-    from .study.commands.demo import Simulation, simulate_to
+    from .study.commands.demo import simulate_to
 
-    simulate_to(out, Simulation(units, episodes, seconds, seed, outlier=outlier, plant=plant, format=format_))
+    settings = {"n_units": units, "n_episodes": episodes, "seconds": seconds, "seed": seed, "outlier": outlier}
+    simulate_to(out, plant, format_, settings)
     _say([f"recordings in {out}"])
 
 

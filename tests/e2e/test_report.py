@@ -277,7 +277,7 @@ def test_results_of_the_short_way_are_plotted(demo, metrics) -> None:
         (run, {"name": "beauty"}, "no figure 'beauty'"),
         (uncertain, {"model": "koopman"}, "there are none, only linear_edmd"),
         (design, {}, "give models="),
-        (models, {"kind": "beauty"}, "no figure of kind 'beauty'; choose one of bode, step, residuals, compare"),
+        (models, {"kind": "beauty"}, "no figure of kind 'beauty'; choose one of bode, compare"),
         (motors, {"size": 3}, "no option size; 'recorded' has unit, condition"),
     ):
         with pytest.raises((ConfigError, DataError), match=match):

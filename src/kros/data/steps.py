@@ -37,6 +37,7 @@ __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Tri
 __getattr__ = refusing(__name__)
 
 GAP = 10.0  # median steps of time that a straight line bridges
+PASSBAND = 0.8  # of a filter that makes the rate fall, as a share of the new Nyquist frequency
 
 
 @dataclass(frozen=True)
@@ -235,7 +236,7 @@ class Resample(Step):
     """Bring uneven time, or another rate, to a fixed period.
 
     At the same or a higher rate this is linear interpolation. When the rate falls, samples are interpolated to a grid
-    that is an integer number of times finer, filtered without delay below the new Nyquist frequency, and thinned. All
+    that is an integer number of times finer, filtered without delay below 0.8 of the new Nyquist frequency, and thinned. All
     channels are treated alike, so linear relations between them survive. Samples in which a channel holds NaN or
     infinity count as not recorded.
 
@@ -245,13 +246,10 @@ class Resample(Step):
     max_gap_s : float, optional, s
         Longest gap in time that a straight line bridges, default: ten median steps. A recording with longer ones is
         cut there, and its longest stretch stays.
-    passband : float
-        Cut-off of the filter as a share of the new Nyquist frequency.
     """
 
     period_s: float
     max_gap_s: float | None = None
-    passband: float = 0.8
     step: ClassVar[str] = "resample"
     makes_even: ClassVar[bool] = True
 
@@ -259,7 +257,6 @@ class Resample(Step):
         """Return the signals at the new sampling period."""
         self._require(0 < self.period_s < math.inf, f"period_s > 0, found {self.period_s}")
         self._require(self.max_gap_s is None or self.max_gap_s > 0, f"max_gap_s > 0, found {self.max_gap_s}")
-        self._require(0 < self.passband < 1, f"0 < passband < 1, found {self.passband}")
         return replace(signals, period_s=self.period_s)
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
@@ -283,7 +280,7 @@ class Resample(Step):
         step = self.period_s / finer
         grid = time_s[0] + step * np.arange(math.floor((time_s[-1] - time_s[0]) / step + CHECK.end) + 1)
         fine = np.column_stack([np.interp(grid, time_s, column) for column in values.T])
-        return fine if finer == 1 else np.ascontiguousarray(lowpass(fine, self.passband * 0.5 / finer)[::finer])
+        return fine if finer == 1 else np.ascontiguousarray(lowpass(fine, PASSBAND * 0.5 / finer)[::finer])
 
 
 @dataclass(frozen=True)

@@ -134,27 +134,17 @@ class HeldOut:
             about = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition}
             for j, channel in enumerate(self.population.states):
                 if columns is None or j in columns:
-                    rows.append(about | {"channel": channel} | _mean([outcome.errors[key][j] for key in keys]))
+                    errors = [outcome.errors[key][j] for key in keys]
+                    means = {name: float(np.mean([of[name] for of in errors])) for name in errors[0]}
+                    rows.append(about | {"channel": channel} | means)
         return rows
 
-    def recorded_rows(self, roles: Mapping[str, str]) -> dict[str, list[Record]]:
-        """Return the errors of the recorded states themselves against the true ones, where recordings hold them."""
-        states, rows = self.population.true_states, list[Record]()
-        for (unit, condition), keys in self.groups.items() if states else ():
-            batch = EpisodeBatch.read(self.population, keys, truths=True)
-            errors = self.errors(batch.states, batch)
-            for j in states:
-                row = {"unit": unit, "role": roles[unit], "condition": condition, "channel": self.population.states[j]}
-                means = _mean([errors[key][j] for key in keys])
-                rows.append(row | {name: mean for name, mean in means.items() if name.startswith("true_")})
-        return {"recorded": rows} if rows else {}
+    def recorded(self) -> Outcome:
+        """Take the recorded states for estimates: their errors against the true ones are known."""
+        (outcome,) = replace(self, sensor={}, band_hz=None, shown=()).outcomes(lambda batch: [batch.states[None]])
+        return replace(outcome, estimated=self.population.true_states)
 
 
 def _at(errors: Mapping[str, Array], episode: int, state: int) -> Record:
     """Return the errors of one state in one episode."""
     return {name: float(values[episode, state]) for name, values in errors.items()}
-
-
-def _mean(errors: Sequence[Record]) -> Record:
-    """Return the means of errors over episodes."""
-    return {name: float(np.mean([of[name] for of in errors])) for name in errors[0]}

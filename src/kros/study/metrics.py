@@ -156,7 +156,7 @@ def _evaluation(context: Context, metrics: Record) -> Record:
         metrics["models"][name]["freerun_error_percent"] = errors
     metrics["observers"] |= evaluated["baselines"]
     entries = {"evaluation": evaluated["rows"], "intervals": interval_rows(evaluated["rows"])}
-    return entries | load_metrics(context) | ({"recorded": evaluated["recorded"]} if "recorded" in evaluated else {})
+    return entries | load_metrics(context) | ({"recorded": evaluated["recorded"]} if evaluated["recorded"] else {})
 
 
 _OF_STAGES = {

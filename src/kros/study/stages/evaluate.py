@@ -47,7 +47,7 @@ def run(context: Context) -> None:
         "band_hz": episodes.band_hz,
         "shown": [[k.unit, k.condition, k.episode] for k in episodes.shown],
         "baselines": {name: outcome.facts for name, outcome in results.items() if name not in observers},
-        **episodes.recorded_rows(roles),
+        "recorded": episodes.rows("recorded", episodes.recorded(), roles) if population.truths else [],
     }
     arrays = _arrays(episodes, results, free_runs)
     save_artifact(context.store.draft("evaluation"), "evaluation", content, arrays)

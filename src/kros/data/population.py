@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, Columns, DataError, Names, Record, member
+from ..core import Array, ByName, Columns, DataError, Names, Record, grouped, member
 from .shown import Shown
 
 DEFAULT_CONDITION = "default"
@@ -292,10 +292,7 @@ class Population(Shown):
     @cached_property
     def _positions(self) -> dict[tuple[str, str], list[int]]:
         """Positions of the episodes of each unit and condition."""
-        positions = dict[tuple[str, str], list[int]]()
-        for i, key in enumerate(self.episodes):
-            positions.setdefault((key.unit, key.condition), []).append(i)
-        return positions
+        return grouped(range(len(self.episodes)), lambda i: (self.episodes[i].unit, self.episodes[i].condition))
 
     @cached_property
     def _units(self) -> dict[str, Unit]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, Columns, Record, frozen
+from ..core import Array, ByName, Columns, Record, frozen, grouped
 from ..data import EpisodeBatch, EpisodeKey, Population
 from ..identify import ModelSet, free_run
 from ..observer import Observer, Sensors
@@ -36,9 +35,7 @@ def observers_run(observers: Sequence[Observer]) -> Run:
 
 def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
     """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
-    groups: dict[Any, list[Observer]] = {}
-    for o in observers:
-        groups.setdefault((o.lifting, tuple(o.parameters.items()), o.measured, o.inputs), []).append(o)
+    groups = grouped(observers, lambda o: (o.lifting, tuple(o.parameters.items()), o.measured, o.inputs))
     return [g[start : start + _TOGETHER] for g in groups.values() for start in range(0, len(g), _TOGETHER)]
 
 
@@ -122,10 +119,7 @@ class HeldOut:
     @property
     def groups(self) -> dict[tuple[str, str], list[EpisodeKey]]:
         """Episodes of every unit and condition."""
-        groups: dict[tuple[str, str], list[EpisodeKey]] = {}
-        for key in self.keys:
-            groups.setdefault((key.unit, key.condition), []).append(key)
-        return groups
+        return grouped(self.keys, lambda key: (key.unit, key.condition))
 
     def rows(self, name: str, outcome: Outcome, roles: Mapping[str, str]) -> list[Record]:
         """Return a row for every unit, condition and estimated channel: means over the unit's episodes."""

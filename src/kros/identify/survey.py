@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import ITERATED, Array, DataError, Work
+from ..core import ITERATED, Array, DataError, Work, grouped
 from ..core.artifacts import Storable, digest_of, divided, file_digest
 from ..core.files import is_file, link_or_copy, stamp_of
 from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, scaling_of, split_episodes
@@ -57,11 +57,8 @@ class RecordingFacts(Storable):
     @cached_property
     def _by_unit(self) -> dict[tuple[str, str], list[EpisodeKey]]:
         """Episodes by part and unit."""
-        episodes: dict[tuple[str, str], list[EpisodeKey]] = {}
-        for part in _PARTS:
-            for key in getattr(self, part):
-                episodes.setdefault((part, key.unit), []).append(key)
-        return episodes
+        parts = {part: grouped(getattr(self, part), lambda key: key.unit) for part in _PARTS}
+        return {(part, unit): keys for part, of in parts.items() for unit, keys in of.items()}
 
     def marks(self, keys: Iterable[EpisodeKey]) -> tuple[str, ...]:
         """Return the digests of some episodes."""

@@ -5,31 +5,21 @@ Errors of observers are in tables by condition, observer and channel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from functools import cached_property
 from operator import itemgetter
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from ..core import ByName, Names, frozen
-from ..core.arrays import T
+from ..core import ByName, Names, frozen, grouped
 from ..data import OUTLIERS, natural_key
 from ..design.task import split_name
 from .names import number, observer_label, readable_unit, words
 
-K = TypeVar("K")
 Rows = Sequence[ByName]
 _CELL = ("condition", "observer", "channel")
-
-
-def grouped(rows: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Return rows by their keys."""
-    groups = dict[K, list[T]]()
-    for row in rows:
-        groups.setdefault(key(row), []).append(row)
-    return groups
 
 
 @frozen

@@ -10,12 +10,11 @@ from operator import itemgetter
 from pathlib import Path
 from xml.etree import ElementTree
 
-from ..core import ConfigError, Record, frozen, write_bytes
+from ..core import ConfigError, Record, frozen, grouped, write_bytes
 from ..core.artifacts import json_bytes
 from ..data import Shown
 from ..uncertainty.outliers.score import FEWEST_UNITS, Status
 from .content import Column, Section, build
-from .facts import grouped
 from .html import filled
 
 Rows = list[Record]

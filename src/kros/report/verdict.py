@@ -9,10 +9,10 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 from operator import itemgetter
 
-from ..core import ByName, frozen
+from ..core import ByName, frozen, grouped
 from ..data import some
 from ..design.task import split_name
-from .facts import ErrorCell, ErrorTable, Facts, grouped
+from .facts import ErrorCell, ErrorTable, Facts
 from .names import condition_label, joined, label_of, number, observer_label, words
 
 Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the section with the details

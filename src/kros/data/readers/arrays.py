@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import Array, ByName, DataError, did_you_mean, frozen, shortened
+from ...core import Array, ByName, DataError, did_you_mean, frozen, grouped, shortened
 from ...core.arrays import as_numbers
 from ..population import DEFAULT_CONDITION, Channel, Channels, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
@@ -205,9 +205,8 @@ def from_frame(
     numbers = np.column_stack([_column(frame, c.name) for c in ordered])
     times = None if time is None else _column(frame, time)
     ids = _ids(frame, unit, None), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0")
-    rows: dict[EpisodeKey, list[int]] = {}  # they need not stand together
-    for row, key in enumerate(map(EpisodeKey, *ids)):
-        rows.setdefault(key, []).append(row)
+    keys = list(map(EpisodeKey, *ids))
+    rows = grouped(range(len(keys)), keys.__getitem__)  # they need not stand together
     places = {key: (numbers[at], None if times is None else times[at]) for key, at in rows.items()}
     recordings = ArrayRecordings(places)
     for key in places:

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...core import AnyArray, StateSpace
+from ...core import AnyArray, StateSpace, grouped
 from ...design.task import split_name
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis
 from ..canvas import Captioned, decibel, frequency_axis, grid, legend
-from ..facts import grouped
 from ..names import label_of, linear_first, method_look, model_label
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from operator import itemgetter
 
-from ...core import ByName
+from ...core import ByName, grouped
 from ..content import Column, Row, Section, build
-from ..facts import Facts, grouped
+from ..facts import Facts
 from ..names import in_condition, number, words
 from ..theme import DRAWING
 

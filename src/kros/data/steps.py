@@ -236,9 +236,9 @@ class Resample(Step):
     """Bring uneven time, or another rate, to a fixed period.
 
     At the same or a higher rate this is linear interpolation. When the rate falls, samples are interpolated to a grid
-    that is an integer number of times finer, filtered without delay below 0.8 of the new Nyquist frequency, and thinned. All
-    channels are treated alike, so linear relations between them survive. Samples in which a channel holds NaN or
-    infinity count as not recorded.
+    that is an integer number of times finer, filtered without delay below 0.8 of the new Nyquist frequency, and
+    thinned. All channels are treated alike, so linear relations between them survive. Samples in which a channel holds
+    NaN or infinity count as not recorded.
 
     Parameters
     ----------

@@ -9,6 +9,7 @@ from itertools import chain
 import numpy as np
 
 from ..core import Array, ByName, Columns, Record, frozen, grouped
+from ..core.linalg import pieces
 from ..data import EpisodeBatch, EpisodeKey, Population
 from ..identify import ModelSet, free_run
 from ..observer import Observer, Sensors
@@ -26,9 +27,9 @@ def observers_run(observers: Sequence[Observer]) -> Run:
     """Return what runs observers that `alike` puts together, as many at once as fill a memory."""
 
     def run(keys: Sequence[EpisodeKey], y: Array, u: Array, values: Mapping[str, Array]) -> Iterator[Array]:
-        count = max(1, _NUMBERS // (y.shape[0] * y.shape[1] * observers[0].lifting.n_states))
-        for start in range(0, len(observers), count):
-            yield run_observers(observers[start : start + count], y, u, observers[0].own(values))
+        count = _NUMBERS // (y.shape[0] * y.shape[1] * observers[0].lifting.n_states)
+        for part in pieces(len(observers), count):
+            yield run_observers(observers[part], y, u, observers[0].own(values))
 
     return run
 
@@ -36,7 +37,7 @@ def observers_run(observers: Sequence[Observer]) -> Run:
 def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
     """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
     groups = grouped(observers, lambda o: (o.lifting, tuple(o.parameters.items()), o.measured, o.inputs))
-    return [g[start : start + _TOGETHER] for g in groups.values() for start in range(0, len(g), _TOGETHER)]
+    return [group[part] for group in groups.values() for part in pieces(len(group), _TOGETHER)]
 
 
 @frozen
@@ -87,11 +88,11 @@ class HeldOut:
     def outcomes(self, run: Callable[[EpisodeBatch], Iterable[Array]], truths: bool = True) -> list[Outcome]:
         """Return the outcomes of estimates, (estimate, n_samples, batch, n or more), some episodes after others."""
         outcomes, n = list[Outcome](), len(self.population.states)
-        for start in range(0, len(self.keys) or 1, SIDE_BY_SIDE):  # none at all are refused where they are read
-            batch = self.read(self.keys[start : start + SIDE_BY_SIDE], truths)
+        for part in pieces(len(self.keys) or 1, SIDE_BY_SIDE):  # none at all are refused where they are read
+            batch = self.read(self.keys[part], truths)
             shown = [(i, key) for i, key in enumerate(batch.keys) if key in self.shown]
             for place, estimate in enumerate(chain.from_iterable(run(batch))):
-                if start == 0:
+                if part.start == 0:
                     outcomes.append(Outcome())
                 outcomes[place].errors.update(self.errors(estimate[..., :n], batch))
                 outcomes[place].shown.update({key: estimate[: batch.lengths[i], i, :n].copy() for i, key in shown})

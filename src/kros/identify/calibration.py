@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..core import Array, Flags, IdentificationError, Storable, Work, digest_of
+from ..core.linalg import pieces
 from ..data import EpisodeKey, Population, split_episodes
 from .survey import RecordingFacts
 
@@ -230,8 +231,8 @@ def segments_of(task: Task) -> list[Segment]:
     names = population.states + population.inputs
     angle, reference = (names.index(n) for n in (spec.angle, spec.reference))
     segments, dt = [], population.sample_period_s
-    whole = map(population.read, keys)
-    for values in (block for one in whole for k in range(0, len(one), _BLOCK) if len(block := one[k : k + _BLOCK]) > 1):
+    episodes = map(population.read, keys)
+    for values in (part for one in episodes for k in pieces(len(one), _BLOCK) if len(part := one[k]) > 1):
         rate = values[:, names.index(spec.measured)] if spec.measured in names else np.gradient(values[:, angle], dt)
         segments += find_segments(values[:, angle], values[:, reference], rate, dt, spec)
     return segments

@@ -22,6 +22,7 @@ from ...core import (
     frozen,
     read_toml,
 )
+from ...core.linalg import pieces
 from ...data import EpisodeKey, Population, read
 from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
@@ -199,13 +200,12 @@ class FieldRecordings:
             arrived = arriving(observer, self.population, {key: recorded}, self.values)
             loop = None if self.name is None else PhaseLockedLoop(observer, self.name, 1)
             course = Course(observer, 1, arrived.parameters, loop)
-            for start in range(0, len(recorded), _BLOCK):
-                block = slice(start, start + _BLOCK)
+            for block in pieces(len(recorded), _BLOCK):
                 run = course.take(arrived.y[block], arrived.u[block])
                 columns = run.estimates[:, 0, : len(observer.recorded)]
                 if loop is not None:
                     columns = np.column_stack([columns, np.broadcast_to(run.followed, run.status.shape)[:, 0]])
-                yield key, start, columns, run.status[:, 0], recorded[block]
+                yield key, block.start, columns, run.status[:, 0], recorded[block]
 
 
 def status_counts(status: Bits) -> Counter[str]:

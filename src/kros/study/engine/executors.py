@@ -21,6 +21,7 @@ from typing import Any
 
 from ...core import ConfigError, Executor, KrosError, MissingDependencyError, Progress, frozen
 from ...core.arrays import T
+from ...core.linalg import pieces
 from .store import code_key
 
 
@@ -77,8 +78,8 @@ class DaskExecutor(Executor):
         from distributed.client import ClosedClientError
 
         tasks = list(tasks)
-        size = min(_LARGEST, -(-len(tasks) // _BATCHES)) or 1
-        batches = [tasks[start : start + size] for start in range(0, len(tasks), size)]
+        size = min(_LARGEST, -(-len(tasks) // _BATCHES))
+        batches = [tasks[part] for part in pieces(len(tasks), size)]
         try:
             futures = self.client.map(partial(run_batch, code_key(), function), batches, pure=False)
         except ClosedClientError as error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from math import ceil, floor, log10
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -14,12 +13,11 @@ from .names import RAISED
 from .theme import DRAWING
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes as Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure as Figure
 else:  # for annotations alone: matplotlib is imported when something is drawn
-    Artist = Axes = Figure = Any
+    Axes = Figure = Any
 
 Captioned = tuple[Figure, str]  # a figure and more of its caption
 
@@ -68,22 +66,14 @@ def decibel(values: ArrayLike) -> AnyArray:
     return 20 * np.log10(np.where(magnitude > 0, magnitude, np.nan))
 
 
-def lines_of_units(axes: Axes, x: AnyArray, lines: AnyArray, colour: str, label: str, units: Sequence[str]) -> None:
-    """Draw thin lines, shape (unit, x), a unit each, with their names; a unit without values is left out."""
+def lines_of_units(axes: Axes, x: AnyArray, lines: AnyArray, colour: str, label: str) -> None:
+    """Draw thin lines, shape (unit, x), a unit each; a unit without values is left out."""
     from matplotlib.collections import LineCollection
 
-    finite = [k for k, line in enumerate(lines) if np.isfinite(line).any()]
-    paths = [np.column_stack([x, lines[k]]) for k in finite]
-    drawn = axes.add_collection(
-        LineCollection(paths, colors=colour, linewidths=DRAWING.thin, alpha=DRAWING.shade, label=label)
-    )
-    name_units(drawn, [units[k] for k in finite])
+    paths = [np.column_stack([x, line]) for line in lines if np.isfinite(line).any()]
+    look: Record = {"linewidths": DRAWING.thin, "alpha": DRAWING.shade}
+    axes.add_collection(LineCollection(paths, colors=colour, label=label, **look))
     axes.autoscale_view()
-
-
-def name_units(drawn: Artist, units: Iterable[str]) -> None:
-    """Name the units behind the lines or points of an artist, in their order: the page shows them on hover."""
-    drawn.set_gid("units-" + ",".join(quote(unit, safe="") for unit in units))
 
 
 def frequency_axis(axes: Axes, freqs_hz: AnyArray) -> None:

@@ -6,11 +6,9 @@ import io
 import logging
 import re
 import time
-from collections.abc import Iterator
 from html import escape
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 from ..core import ConfigError, Progress, write_bytes
 from .canvas import Figure
@@ -61,26 +59,10 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
     text = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", text)
     opening = rf'<svg viewBox="\1" role="img" aria-label="{escape(title)}" xmlns:xlink="http://www.w3.org/1999/xlink">'
     text = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', opening, text, count=1)
-    text = _named_units(text)
     for tone in Tone:
         text = text.replace(tone, f"var({tone.variable})")
     text = _FAMILY.sub(_FONTS, text)
     return _COORDINATES.sub(lambda match: _BEYOND.sub("", match.group()), text).strip()
-
-
-def _named_units(text: str) -> str:
-    """Write the names of units, which are the identifiers of groups, to the lines or points inside, in order."""
-    first, *rest = re.split(r'<g id="[^"]*?units-([^"]*)">', text)
-    parts = [first]
-    for names, group in zip(rest[::2], rest[1::2], strict=True):
-        left = iter(names.split(","))
-
-        def named(match: re.Match[str], left: Iterator[str] = left) -> str:
-            name = None if match[2] is None else next(left, None)
-            return match[0] if name is None else f'{match[0]}data-unit="{escape(unquote(name))}" '
-
-        parts.append("<g>" + re.sub(r"<defs>.*?</defs>|(<(use|path) )", named, group, flags=re.DOTALL))
-    return "".join(parts)
 
 
 def _encode(figure: Figure, kind: str, **options: Any) -> bytes:

@@ -58,12 +58,11 @@ def entries_figure(run: RunFolder, residuals_of: Mapping[str, UnitResiduals], al
 def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, alarm: str | None) -> None:
     """Draw the entries of one kind of model."""
     inside, freqs = differing(residuals), residuals.freqs_hz
-    units = [residuals.unit_ids[k] for k in inside]
     levels, bound, fitted = decibel(residuals.entries), decibel(residuals.largest), decibel(residuals.entry_weights)
     for i, row in enumerate(block):
         for j, panel in enumerate(row):
             panel.axis("on")
-            lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE, "units", units)
+            lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE, "units")
             panel.plot(freqs, bound[:, i, j], color=Tone.BLUE, lw=DRAWING.broad, alpha=DRAWING.shade, label="largest")
             panel.plot(freqs, fitted[:, i, j], color=Tone.INK, label="fitted weight")
             if alarm in residuals.unit_ids:

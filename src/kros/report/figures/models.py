@@ -33,7 +33,7 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
     figure, axes = grid(rows, 2 * inputs, sharex=True)
     for (i, j), panel in np.ndenumerate(axes):
         lines = values[j % 2][:, :, i, j // 2]
-        lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
+        lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units")
         if nominal in models.unit_ids:
             panel.plot(freqs, lines[models.index(nominal)], color=Tone.INK, label=f"nominal, unit {nominal}")
         frequency_axis(panel, freqs)

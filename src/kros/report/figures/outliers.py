@@ -6,7 +6,7 @@ import numpy as np
 
 from ...data import natural_key, some
 from ...uncertainty import OutlierModel
-from ..canvas import Axes, Captioned, grid, name_units, note, units_axis
+from ..canvas import Axes, Captioned, grid, note, units_axis
 from ..names import condition_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
@@ -44,8 +44,7 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
         ends = score.lowest_db + shift, score.highest_db + shift
         axes.plot([place] * 2, ends, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
-        (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone)
-        name_units(point, [score.unit])
+        axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone)
         if score.outlier or score is highest:
             note(axes, score.unit, (place, score.score_db), (8, 0), xycoords="data", va="center", color=tone)
     if np.isfinite(model.threshold_db):

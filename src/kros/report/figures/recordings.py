@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import compress
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from ..canvas import (
     label_below,
     legend,
     logarithmic,
-    name_units,
     note,
     set_titles,
     units_axis,
@@ -130,8 +128,7 @@ def phase_figure(calibration: PhaseCalibration, pooled: Sequence[str]) -> Figure
     inside = np.isin(units, pooled)
     for column, panel in zip(columns, axes[0], strict=True):
         for chosen, face in ((inside, Tone.BLUE), (~inside, "none")):
-            (drawn,) = panel.plot(*np.nonzero(chosen), column[chosen], "o", ms=4, color=Tone.BLUE, mfc=face)
-            name_units(drawn, compress(units, chosen))
+            panel.plot(*np.nonzero(chosen), column[chosen], "o", ms=4, color=Tone.BLUE, mfc=face)
         units_axis(panel, units)
     set_titles(axes[0], ("phase (°)", "lag (°)", "concentration"))
     axes[0, 0].set_yticks([0, 180, 360])

@@ -148,11 +148,10 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     """Draw every unit relative to the weights, dB, the largest one dark; the dashed line is what the weights allow."""
     rows, freqs = differing(residuals), residuals.freqs_hz
     levels = decibel(residuals.ratio)[rows]
-    names = [residuals.unit_ids[k] for k in rows]
-    lines_of_units(axes, freqs, levels, Tone.BLUE, "units", names)
+    lines_of_units(axes, freqs, levels, Tone.BLUE, "units")
     first = int(np.where(np.isfinite(levels), levels, -np.inf).max(axis=1).argmax())
     axes.plot(freqs, levels[first], color=Tone.INK)
-    note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK)
+    note(axes, f"unit {residuals.unit_ids[rows[first]]}", (1, 0), (-3, 3), ha="right", color=Tone.INK)
     axes.axhline(0, color=Tone.ALARM, lw=DRAWING.thin, ls="--")
     frequency_axis(axes, freqs)
 

@@ -1,5 +1,5 @@
 "use strict";
-// The page is complete without this: it adds sorting, filtering, names of units on hover, zoom on click, and opens what a link leads to.
+// The page is complete without this: it adds sorting, filtering, zoom on click, and opens what a link leads to.
 (() => {
   const all = (selector, root = document) => [...root.querySelectorAll(selector)];
   document.documentElement.className = "js";
@@ -51,29 +51,8 @@
   addEventListener("hashchange", open);
   open();
 
-  const tip = Object.assign(document.createElement("div"), { className: "tip", hidden: true });
-  document.body.append(tip);
-  let marked = "";
-  const mark = unit => {
-    if (unit === marked) return;
-    all(".near").forEach(one => one.classList.remove("near"));
-    if (unit) all("svg [data-unit]").forEach(one => one.classList.toggle("near", one.dataset.unit === unit));
-    marked = unit;
-  };
   for (const picture of all("figure svg")) {
     picture.parentElement.onclick = () => picture.classList.toggle("zoomed");
-    picture.onpointermove = event => {
-      const near = [[0, 0], [0, 3], [0, -3], [3, 0], [-3, 0]].flatMap(([x, y]) => document.elementsFromPoint(event.clientX + x, event.clientY + y));
-      const found = near.map(one => one.closest("[data-unit]")).find(Boolean) ?? null;
-      mark(found ? found.dataset.unit : "");
-      tip.hidden = !found;
-      if (found) {
-        tip.textContent = found.dataset.unit;
-        tip.style.left = `${Math.min(event.clientX + 12, innerWidth - tip.offsetWidth - 4)}px`;
-        tip.style.top = `${event.clientY + 14}px`;
-      }
-    };
-    picture.onpointerleave = () => { tip.hidden = true; mark(""); };
   }
 
   if (window.IntersectionObserver) {

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from ...core import AnyArray
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, residual, sigma_max
-from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
+from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.unit_residuals import UnitResiduals
 from ...uncertainty.weights.cover import Cover
 from ..canvas import (
@@ -84,24 +84,18 @@ def draw_forms(axes: Axes, model: UncertainModel) -> None:
 
 def weights(run: RunFolder) -> Captioned:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
-    rows = {n: (run.uncertain[n], run.models[n], residuals) for n, residuals in run.unit_residuals.items()}
-    parts = [f"{model_label(n)} {number(model.overbound_db_max)} dB" for n, (model, _, _) in rows.items()]
-    return weights_figure(rows), (
-        "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free. "
-        f"Largest mean excess of a weight: {', '.join(parts)}. A unit at most 0 dB is bounded."
-    )
-
-
-def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResiduals]]) -> Figure:
-    """Draw the weights of a kind of model, and every unit relative to them, a row a kind."""
-    figure, axes = grid(len(rows), 3, sharex=True)
-    for row, (name, (model, models, residuals)) in zip(axes, rows.items(), strict=True):
+    chosen, parts = run.unit_residuals, list[str]()
+    figure, axes = grid(len(chosen), 3, sharex=True)
+    for row, (name, residuals) in zip(axes, chosen.items(), strict=True):
+        model = run.uncertain[name]
         both = model.form.at_input and model.form.sees_input
-        _draw_weights(row, model, models.inputs if both else ())
+        _draw_weights(row, model, run.models[name].inputs if both else ())
         ratio_panel(row[2], residuals)
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
+        parts.append(f"{model_label(name)} {number(model.overbound_db_max)} dB")
     set_titles(axes[0], ("left weight", "right weight", "units relative to the weights"))
-    return figure
+    text = "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free. "
+    return figure, f"{text}Largest mean excess of a weight: {', '.join(parts)}. A unit at most 0 dB is bounded."
 
 
 def uncertain_figure(model: UncertainModel) -> Figure:
@@ -176,8 +170,5 @@ def outlier_residuals(run: RunFolder) -> Captioned:
 
 
 def sets_figure(models: UncertainModels, model: str | None = None) -> Figure:
-    """Draw the weights of one kind of model, the first by default."""
-    name = model or next(iter(models.sets))
-    identified = models.models.models(name)
-    uncertain = models.sets[name]
-    return weights_figure({name: (uncertain, identified, residuals_beside_weights(identified, uncertain))})
+    """Draw one kind of model, the first by default."""
+    return uncertain_figure(models.sets[models.models.models(model or next(iter(models.sets))).name])

@@ -15,10 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import ceil
+from operator import itemgetter
 
 import numpy as np
 
-from ..core import ITERATED, Array, ArrayLike, ByName, DataError, Names, Record
+from ..core import ITERATED, Array, ArrayLike, ByName, DataError, Names, Record, grouped
 
 _CELL = ("observer", "condition", "channel")
 
@@ -61,12 +62,9 @@ def unit_interval(values: ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[
 
 def interval_rows(rows: Sequence[ByName]) -> list[Record]:
     """Return the 95 % ``interval`` of the mean error over at least three units, by observer, condition and channel."""
-    errors: dict[Names, Record] = {}
-    for row in (row for row in rows if row["role"] == "off_nominal"):
-        errors.setdefault(tuple(row[name] for name in _CELL), {})[row["unit"]] = row["error_percent"]
     intervals = []
-    for cell, by_unit in errors.items():
-        values = np.array([by_unit[unit] for unit in sorted(by_unit)], dtype=float)  # unknown is NaN
+    for cell, of in grouped((row for row in rows if row["role"] == "off_nominal"), itemgetter(*_CELL)).items():
+        values = np.array([row["error_percent"] for row in sorted(of, key=itemgetter("unit"))], float)  # unknown is NaN
         if len(values) > 2 and np.isfinite(values).all():
             interval = [float(end) for end in unit_interval(values)]
             intervals.append({**dict(zip(_CELL, cell, strict=True)), "role": "off_nominal", "interval": interval})

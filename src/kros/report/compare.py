@@ -25,7 +25,7 @@ def compared(study: ByName, facts: Facts) -> dict[str, ByName]:
     return {
         "settings": study,
         "recordings": facts.study,
-        "verdict": {"status": verdict.status.value, "reasons": [reason.text for reason in verdict.reasons]},
+        "verdict": {"status": verdict.status.value, "points to check": len(verdict.reasons)},
         "errors in percent": errors,
         "models": _parts(facts.get("uncertainty"), _OF_MODELS),
         "observers": _parts(facts.observers, _OF_OBSERVERS),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from ...identify import ModelSet
 from ...uncertainty import Form
 from ...uncertainty.unit_residuals import UnitResiduals
@@ -34,23 +36,16 @@ def differing(residuals: UnitResiduals) -> list[int]:
 
 
 def entries_figure(run: RunFolder, residuals_of: Mapping[str, UnitResiduals], alarm: str | None = None) -> Figure:
-    """Draw entries of all units with their bound and its fit, models side by side or one below the other."""
-    sizes = {
-        name: (min(r.largest.shape[1], DRAWING.states), min(r.largest.shape[2], DRAWING.states))
-        for name, r in residuals_of.items()
-    }
-    together = sum(columns for _, columns in sizes.values()) <= DRAWING.states
-    rows = (max if together else sum)(p for p, _ in sizes.values())
-    columns = (sum if together else max)(m for _, m in sizes.values())
-    figure, axes = grid(rows, columns, sharex=True, sharey=True)
+    """Draw entries of all units with their bound and its fit, models one below the other."""
+    sizes = [np.minimum(residuals.largest.shape[1:], DRAWING.states) for residuals in residuals_of.values()]
+    figure, axes = grid(sum(p for p, _ in sizes), max(m for _, m in sizes), sharex=True, sharey=True)
     for panel in axes.ravel():
         panel.axis("off")
-    top, left = 0, 0
-    for name, residuals in residuals_of.items():
-        p, m = sizes[name]
+    top = 0
+    for (name, residuals), (p, m) in zip(residuals_of.items(), sizes, strict=True):
         names = entry_names(residuals.form, run.models[name])
-        _draw_block(axes[top : top + p, left : left + m], residuals, names, model_label(name), alarm)
-        left, top = (left + m, top) if together else (left, top + p)
+        _draw_block(axes[top : top + p, :m], residuals, names, model_label(name), alarm)
+        top += p
     legend(axes[0, 0])
     return figure
 

@@ -283,12 +283,6 @@ MAPPING: dict[str, Any] = {
     "files": r"(?P<unit>[ab])_(?P<episode>\d+)\.csv",
     "time": "t",
     "channel": [{"name": c.name, "column": c.name, "role": c.role.value, "measured": c.measured} for c in CHANNELS],
-    "prepare": [
-        {"step": "trim", "start": 2},
-        {"step": "scale", "channels": ["torque"], "factor": 2.0, "unit": "N m"},
-        {"step": "differentiate", "channel": "position", "name": "speed", "cutoff_hz": 20.0},
-        {"step": "resample", "period_s": 0.02},
-    ],
     "metadata": {"plant": "x"},
 }
 STUDY: dict[str, Any] = {
@@ -297,7 +291,12 @@ STUDY: dict[str, Any] = {
         "source": "csv",
         "reader": "csv",
         "csv": MAPPING,
-        "prepare": [{"step": "trim", "start": 1}],
+        "prepare": [
+            {"step": "trim", "start": 2},
+            {"step": "scale", "channels": ["torque"], "factor": 2.0, "unit": "N m"},
+            {"step": "differentiate", "channel": "position", "name": "speed", "cutoff_hz": 20.0},
+            {"step": "resample", "period_s": 0.02},
+        ],
         "exclude": ["a"],
     },
     "lifting": {"functions": ["sin(position)"], "families": [{"kind": "harmonics", "angle": "position", "ratio": 3}]},
@@ -340,7 +339,6 @@ def toml_target(cases: str, path: Path, tree: dict[str, Any], read: Callable[[Pa
 
 def recordings_targets(root: Path) -> list[Target]:
     """The readers of files."""
-    plain_csv = {**MAPPING, "prepare": []}
     for unit in "ab":
         for episode in range(2):
             path = root / "csv" / f"{unit}_{episode}.csv"
@@ -360,7 +358,7 @@ def recordings_targets(root: Path) -> list[Target]:
         folder_target(
             "reader csv",
             root / "csv",
-            lambda p: recorded(read(p, "csv", mapping=plain_csv)),
+            lambda p: recorded(read(p, "csv", mapping=MAPPING)),
             lambda _, c, r: mutate_text(c, r),
             False,
         ),

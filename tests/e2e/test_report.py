@@ -27,6 +27,7 @@ from kros.report.figures.synthesis import scaled_filter
 from kros.report.figures.uncertainty import published_bounds
 from kros.report.files import write_figures
 from kros.report.html import render
+from kros.report.manifest import Artefact, describe, write_manifest
 from kros.report.names import observer_label
 from kros.report.run_folder import RunFolder
 from kros.study.pipeline import RunResult
@@ -165,7 +166,10 @@ def test_a_part_of_a_run_has_a_report(tmp_path) -> None:
     assert "NOT READY" in text
     assert all((drawn := draw(name, RunFolder(tmp_path))).figure is None and drawn.reason for name in FIGURES)
     (tmp_path / "evaluation").mkdir()
-    (tmp_path / "evaluation" / "evaluation.json").write_text("{")
+    name = "evaluation/evaluation.json"
+    (tmp_path / name).write_text("{")
+    files = {name: describe(tmp_path / name), "population/facts.json": describe(tmp_path / "population" / "facts.json")}
+    write_manifest(tmp_path, {"evaluate": Artefact(digest=64 * "0", files=files)})
     (tmp_path / "report.html").unlink()
     with pytest.raises(DataError, match="not valid JSON"):
         render(tmp_path, metrics)

@@ -22,7 +22,7 @@ from ..identify.survey import RecordingFacts
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
-from .manifest import MANIFEST, recorded_files
+from .manifest import recorded_files
 from .names import linear_first
 
 
@@ -56,8 +56,6 @@ class RunFolder:
     @cached_property
     def files(self) -> frozenset[str]:
         """Names of all files that belong to the run, relative to its folder."""
-        if not (self.folder / MANIFEST).exists():  # put together by hand
-            return frozenset(p.relative_to(self.folder).as_posix() for p in self.folder.rglob("*") if p.is_file())
         return recorded_files(self.folder)
 
     def has(self, name: str) -> bool:

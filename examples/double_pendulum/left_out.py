@@ -22,6 +22,7 @@ import numpy as np
 import kros
 from kros.core.artifacts import load_artifact
 from kros.data import EpisodeBatch, Population, read, split_episodes
+from kros.data.readers.csv_folder import CsvMapping
 from kros.design.baselines import make_difference, make_extended, make_learned
 from kros.design.training import TrainingSet
 from kros.evaluate import error_percent, unit_interval
@@ -82,11 +83,11 @@ def main() -> None:
 
 def without_other_joint(config: StudyConfig) -> StudyConfig:
     """Return the study with the commanded torque as its only input."""
-    mapping = dict(config.data.csv or {})
-    mapping["channel"] = [c for c in mapping["channel"] if not c["name"].startswith("other")]
-    units = [u["columns"].items() for u in mapping["unit"]]
-    columns = [{name: column for name, column in own if not name.startswith("other")} for own in units]
-    mapping["unit"] = [{**u, "columns": own} for u, own in zip(mapping["unit"], columns, strict=True)]
+    tables = config.data.model_dump()["csv"]
+    tables["channel"] = [c for c in tables["channel"] if not c["name"].startswith("other")]
+    for unit in tables["unit"]:
+        unit["columns"] = {name: column for name, column in unit["columns"].items() if not name.startswith("other")}
+    mapping = CsvMapping.model_validate(tables)
     return config.model_copy(update={"data": config.data.model_copy(update={"csv": mapping})})
 
 

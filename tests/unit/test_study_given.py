@@ -50,8 +50,9 @@ def test_preparation_steps_are_applied_to_what_is_given(tmp_path):
 
 
 def test_a_mapping_of_csv_columns_is_refused(tmp_path):
+    mapping = {"files": "x", "sample_period_s": 0.1, "channel": [{"name": "x", "role": "state"}]}
     with pytest.raises(ConfigError, match="population already"):
-        groups(population(), tmp_path / "run", csv={"files": "x"})
+        groups(population(), tmp_path / "run", csv=mapping)
     assert not (tmp_path / "run").exists()
 
 

@@ -105,7 +105,7 @@ class EstimatorSettings(Settings):
         description="least and largest value that a state can have, as the current of a drive; estimates stay inside",
     )
     reach: float = Field(
-        1.0,
+        2.0,
         ge=0,
         description="distance that a missing measurement may have from the fallback, in RMS distances of recorded ones "
         "from what the inputs say",

@@ -107,9 +107,10 @@ class TrainingSet:
 
 
 def percent_of(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
-    """Return mean errors of observers of one model in percent of a unit's largest value, (observer, n), else infinite.
+    """Return typical errors of observers of one model in percent of a unit's largest value, (observer, n), or infinity.
 
-    A unit's largest value is that of all its episodes in a condition: an episode without motion has no size.
+    A unit's largest value is that of all its episodes in a condition: an episode without motion has no size. The mean
+    over units is geometric, so that a defective one does not decide.
     """
     x, lengths, y = batch.states, batch.lengths, batch.measurements(observers[0].measured)
     size, groups = largest(x, lengths), np.array([f"{key.unit}\n{key.condition}" for key in batch.keys])
@@ -117,7 +118,10 @@ def percent_of(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
     runs = observers_run(observers)(batch.keys, y, batch.inputs, batch.parameters)
     with np.errstate(divide="ignore", invalid="ignore"):
         rms = (error_rms(e[..., : x.shape[-1]], x, lengths) for e in chain.from_iterable(runs))
-        errors = [(100 * error / size).mean(axis=0) for error in rms]
+        percents = np.array([100 * error / size for error in rms])
+    units = np.array([key.unit for key in batch.keys])
+    by_unit = np.stack([percents[:, units == unit].mean(axis=1) for unit in dict.fromkeys(units)])
+    errors = np.exp(np.log(np.maximum(by_unit, TINY)).mean(axis=0))
     return np.where(np.isfinite(errors), errors, np.inf)
 
 

@@ -121,7 +121,7 @@ def identify_estimator(
         return dict(zip(states, values.tolist(), strict=True))
 
     errors = readout.typical
-    growth = np.sqrt(readout.left_out).mean(axis=0) / np.sqrt(readout.trained).mean(axis=0)  # of mean errors
+    growth = errors / np.exp(np.log(readout.trained).mean(axis=0) / 2)
     worst = np.sqrt(readout.episode_errors().max(axis=0))
     facts = {
         "channels": family,

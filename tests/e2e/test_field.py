@@ -181,7 +181,11 @@ def test_missing_samples_are_taken_and_counted(kros, demo, field, tmp_path) -> N
     assert all(np.isfinite(found[c].to_numpy()).all() for c in ("velocity_hat", "current_hat"))
     good = np.array(found["status"].to_pylist()) == "GOOD"
     assert {"MISSING", "INVALID_INPUT"} <= set(found["status"].to_pylist())
-    np.testing.assert_array_equal(np.isfinite(found["velocity_band"].to_numpy()), good)  # what is lost has no bound
+    name = json.loads((demo / "observers/deployed.json").read_text())["name"]
+    settle = json.loads((demo / "metrics.json").read_text())["observers"][name].get("settle_samples", 0)
+    k, episode = found["k"].to_numpy(), np.cumsum(found["k"].to_numpy() == 0)
+    settled = [good[(episode == e) & (k <= i) & (k >= i - settle)].all() for e, i in zip(episode, k, strict=True)]
+    np.testing.assert_array_equal(np.isfinite(found["velocity_band"].to_numpy()), settled)  # no bound after a loss
 
 
 def test_what_does_not_fit_is_said(kros, lifted, field, tmp_path) -> None:

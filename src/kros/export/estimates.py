@@ -45,7 +45,8 @@ def writer(out: Path, period_s: float, facts: Record) -> Iterator[Write]:
             def write(key: EpisodeKey, start: int, status: Bits, values: Array) -> None:
                 k, bits = np.arange(start, start + len(values)), [SampleStatus(int(one)).name for one in status]
                 labels = [[name] * len(k) for name in (key.unit, key.condition, key.episode)]
-                content = dict(zip(schema.names, [*labels, k, k * period_s, bits, *values.T], strict=True))
+                columns = (pa.array(column, from_pandas=True) for column in values.T)  # empty where there is no number
+                content = dict(zip(schema.names, [*labels, k, k * period_s, bits, *columns], strict=True))
                 file.write_table(pa.Table.from_pydict(content, schema=schema), max(len(k), 1))
 
             yield write

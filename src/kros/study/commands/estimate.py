@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core import ConfigError, Record
+from ...data import EpisodeKey
 from ...export.estimates import ENDINGS, writer
 from ...observer import recorded_channel, recorded_factors
 from ..config import Stage
@@ -21,7 +22,8 @@ def estimate_recordings(
 ) -> list[str]:
     """Write what `facts_of` names for every sample; return what people read.
 
-    The band is the bound of the RMS error for recorded signals, where the observer has one and the sample is good.
+    The band is the bound of the RMS error for recorded signals, where the observer has one and the sample is good, and
+    so were `settle_samples` before it.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
         if out.exists() or out.suffix not in ENDINGS:
@@ -33,9 +35,14 @@ def estimate_recordings(
         bound = np.array([stated.get("set_bound", {}).get(name) for name in names], dtype=float)
         factors = recorded_factors(observer, [*(c.name for c in population.channels), *names])
         counts, n = defaultdict[str, Counter[str]](Counter), len(names)
+        settle, latest = stated.get("settle_samples", 0), dict[EpisodeKey, float]()  # samples that are not good
         with writer(out, population.sample_period_s, facts_of(recordings)) as write:
             for key, start, columns, status, recorded in recordings.estimates():
-                band = np.where(status[:, None] == 0, bound / np.abs(factors[-n:]), np.nan)
+                k = np.arange(start, start + len(status))
+                disturbed = np.where(status != 0, k, latest.get(key, -np.inf))
+                settled = k - np.maximum.accumulate(disturbed) > settle
+                latest[key] = disturbed.max()
+                band = np.where(settled[:, None], bound / np.abs(factors[-n:]), np.nan)
                 values = np.hstack([np.hstack([recorded, columns[:, :n]]) / factors, band, columns[:, n:]])
                 write(key, start, status, values)
                 counts[key.unit].update(status_counts(status))

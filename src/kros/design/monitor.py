@@ -151,9 +151,11 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
 
 
 def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
-    """Return the samples in which a start is forgotten, by the slowest mode of the observer's linear part."""
+    """Return the samples in which a start is forgotten, by the slowest mode of the linear part or of a bank's filters."""
     n, r, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted
-    step = observer.one_step[:, [*range(n), *range(nl, nl + r)]]
-    radius = float(spectral_radius(step))
+    radius = float(spectral_radius(observer.one_step[:, [*range(n), *range(nl, nl + r)]]))
+    if observer.bank is not None:
+        z = slice(len(observer.recorded), len(observer.recorded) + observer.bank.filters)
+        radius = float(max(spectral_radius(observer.A[z, z]), *observer.bank.start_recovery))
     samples = settings.settle[1] if radius >= 1 else np.log(settings.forgotten) / np.log(max(radius, ITERATED))
     return int(np.clip(np.ceil(samples), *settings.settle)) + observer.runtime.delay

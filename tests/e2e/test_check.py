@@ -104,7 +104,7 @@ def test_good_units_are_not_flagged_for_being_recorded_less(checked, tmp_path, e
         assert row["episodes"] == episodes
         assert row["recorded_s"] == pytest.approx(episodes * samples * PERIOD_S, rel=0.02)
         assert (row["needed_s"] > 1.01 * row["recorded_s"]) == (row["status"] == "not enough data")
-        assert row["status"] != "ok" or 0 < row["detectable"] <= 900
+        assert row["status"] != "ok" or 0 < row["detectable"]["velocity"] <= 100
     assert {r["status"] == "not enough data" for r in rows} == {episodes * samples < 2000}
 
 

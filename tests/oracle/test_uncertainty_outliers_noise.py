@@ -36,7 +36,7 @@ def batch(rng: np.random.Generator, count: int = 12) -> OutlierModel:
 
 
 def test_the_change_beside_a_score_is_what_would_have_been_flagged() -> None:
-    """A unit in the middle of the others is flagged with an entry changed by clearly more, with none by clearly less."""
+    """A unit in the middle of the others is flagged with an output changed by clearly more, with none by clearly less."""
     rng = np.random.default_rng(6)
     model = batch(rng, 16)
     middle = np.median(model.responses.real, axis=0) + 1j * np.median(model.responses.imag, axis=0)
@@ -44,12 +44,10 @@ def test_the_change_beside_a_score_is_what_would_have_been_flagged() -> None:
     score = model.score("ok", middle)
     assert score.status is Status.OK
     for factor, expected in ((0.5, False), (3.0, True)):
-        flagged = []
-        for i, j in np.ndindex(*middle.shape[1:]):
+        for i, percent in enumerate(score.detectable_percent):
             changed = middle.copy()
-            changed[:, i, j] *= 1 + factor * score.detectable_percent / 100
-            flagged.append(model.score("changed", changed).outlier)
-        assert any(flagged) is expected
+            changed[:, i] *= 1 + factor * percent / 100
+            assert model.score("changed", changed).outlier is expected
 
 
 def test_few_units_tell_nothing(tmp_path: Path) -> None:
@@ -59,7 +57,7 @@ def test_few_units_tell_nothing(tmp_path: Path) -> None:
     model.save(tmp_path / "four")
     assert OutlierModel.load(tmp_path / "four").scores == model.scores
     three = batch(np.random.default_rng(8), 3)
-    assert np.isinf(three.scores[0].detectable_percent)
+    assert three.scores[0].detectable_percent == ()
     three.save(tmp_path / "three")
     assert OutlierModel.load(tmp_path / "three").score("new", three.responses[0]).status is Status.CANNOT_TELL
 

@@ -1,6 +1,7 @@
 """What `kros check` says of units whose hidden channels were not recorded, by the number of units behind the monitor's bound."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -11,7 +12,7 @@ from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.observer.monitor import Monitor, octaves
 from kros.report.unit_verdicts import html_text, junit_text, verdict_lines, with_verdict, worst
-from kros.study.commands.check import monitored
+from kros.study.commands.check import errors_beside_bounds, monitored
 from kros.study.commands.field import FieldRecordings
 from kros.uncertainty.outliers.score import FEWEST_UNITS as FEWEST
 
@@ -55,8 +56,7 @@ def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_t
     plain = {
         "score": 1.0,
         "threshold": 2.0,
-        "detectable": 5.0,
-        "detectable_hz": 3.0,
+        "detectable": {"force": 5.0},
         "units": 12,
         "fewest_units": 14,
         "left_out": [],
@@ -83,3 +83,63 @@ def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_t
     assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == ("3", "1", "1")
     assert [[child.tag for child in case] for case in suite] == [[], ["error"], ["failure"]]
     assert suite[1].attrib["name"] == '<b "__&'
+
+
+SCORED = {
+    "unit": "a",
+    "condition": "cold",
+    "score": 1.0,
+    "threshold": 2.0,
+    "status": "ok",
+    "outlier": False,
+    "units": 12,
+    "left_out": [],
+}
+
+
+@pytest.mark.parametrize(
+    ("verdict", "gains", "ratio", "units", "text"),
+    [
+        ("PASS", {"speed": 3.0, "force": 40.0}, 0.9, 12, "a change of the gain of force above 40 % would be detected"),
+        ("UNDECIDED", {"speed": 3.0, "force": 116.0}, 0.9, 12, "only a change of the gain of force above 116 %"),
+        ("UNDECIDED", {"force": 40.0}, 1.5, 12, "error of force 3.00 N, at most 2.00 N expected"),
+        ("FAIL", {"force": 40.0}, 2.1, 12, "error of force 4.20 N, at most 2.00 N expected"),
+        ("FAIL", {"force": 40.0}, None, 12, "error of force – N, at most 2.00 N expected"),
+        ("UNDECIDED", {"force": 40.0}, 2.1, FEWEST - 1, "error of force 4.20 N"),
+    ],
+)
+def test_a_pass_excludes_a_change_of_every_hidden_state_and_an_error_beyond_the_bound(
+    verdict: str, gains: dict[str, float], ratio: float | None, units: int, text: str
+) -> None:
+    error = {"state": "force", "rms": ratio and 2.0 * ratio, "bound": 2.0, "ratio": ratio, "unit": "N"}
+    row = with_verdict(SCORED | {"detectable": gains, "error": error, "units": units})
+    assert row["verdict"] == verdict
+    assert text in row["reason"]
+
+
+def test_errors_stand_beside_bounds_with_the_change_of_gain_that_they_exclude() -> None:
+    """A mass whose recorded velocity has 0.4 of its size: the error is 0.6 of it, and the change that shows is known."""
+    one = recordings(FEWEST, 0.0)
+    values = one.population.read(one.population.episodes[0])
+    A, B = one.observer.A, one.observer.B
+    x = np.zeros((len(values), 2))
+    for k in range(len(values) - 1):
+        x[k + 1] = A @ x[k] + B[:, 0] * values[k, 1]
+    whole = np.column_stack([x, values[:, 1]])
+    channels = (CHANNELS[0], Channel("velocity", Role.STATE, "m/s", False), CHANNELS[1])
+    population = from_arrays({"good": [whole], "bad": [whole * (1.0, 0.4, 1.0)]}, channels, 0.01)
+    bound = 0.5 * float(x[:, 1].std())
+    context = SimpleNamespace(
+        facts=SimpleNamespace(identify_on="default"),
+        deployed=one.observer,
+        observers_record={"facts": {one.observer.name: {"set_bound": {"velocity": bound, "position": 1.0}}}},
+        config=SimpleNamespace(sensor={}),
+    )
+    found = errors_beside_bounds(context, population, {"good": {}, "bad": {}})
+    ((good,), (bad,)) = found["good", "default"], found["bad", "default"]
+    assert (good["state"], good["unit"], good["bound"]) == ("velocity", "m/s", bound)
+    assert good["ratio"] < 1e-9
+    assert bad["rms"] == pytest.approx(0.6 * float(np.sqrt((x[:, 1] ** 2).mean())))
+    assert (good["gain_percent"], bad["gain_percent"]) == (pytest.approx(50.0), pytest.approx(125.0))
+    context.observers_record = {"facts": {}}
+    assert errors_beside_bounds(context, population, {}) == {}

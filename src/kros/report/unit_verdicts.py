@@ -14,8 +14,10 @@ from ..core import ConfigError, Record, frozen, grouped, write_bytes
 from ..core.artifacts import json_bytes
 from ..data import Shown
 from ..uncertainty.outliers.score import FEWEST_UNITS, Status
+from ..uncertainty.settings import OUTLIER
 from .content import Column, Section, build
 from .html import filled
+from .names import number, readable_unit, words
 
 Rows = list[Record]
 _COLUMNS = [
@@ -55,8 +57,13 @@ class Verdict(StrEnum):
 
 def with_verdict(row: Record) -> Record:
     """Return a row of scores with its verdict and the reason in words."""
-    verdict = Verdict.PASS if row["status"] == Status.OK else Verdict.UNDECIDED
-    return row | {"verdict": Verdict.FAIL if row["outlier"] else verdict, "reason": "; ".join(_reasons(row))}
+    error, gains = row.get("error"), row.get("detectable") or {}
+    ratio = error["ratio"] if error else 0.0
+    within = ratio is not None and ratio <= 1 and all(p <= OUTLIER.passed_percent for p in gains.values())
+    verdict = Verdict.PASS if row["status"] == Status.OK and within else Verdict.UNDECIDED
+    beyond = error and row["units"] >= FEWEST_UNITS and (ratio is None or ratio > OUTLIER.failed)
+    verdict = Verdict.FAIL if row["outlier"] or beyond else verdict
+    return row | {"verdict": verdict, "reason": "; ".join(_reasons(row))}
 
 
 def by_unit(rows: Sequence[Record]) -> dict[str, tuple[Verdict, list[str]]]:
@@ -121,10 +128,13 @@ def _reasons(row: Record) -> list[str]:
     elif row["status"] == Status.OTHER_MOTIONS:
         less = "beyond the others, but by no more than one unit differs from motion to motion"
         reasons.append(f"{less}; repeat the motions of the study")
-    elif row.get("detectable") is not None and not row["outlier"]:
-        only = "only " if row["status"] == Status.CANNOT_TELL else ""
-        change = f"{only}a change of gain above {row['detectable']:.2g} % would be detected"
-        reasons.append(f"{change}, at {row['detectable_hz']:.3g} Hz")
+    elif (gains := row.get("detectable")) and not row["outlier"]:
+        state, percent = max(gains.items(), key=itemgetter(1))
+        only = "only " if row["status"] == Status.CANNOT_TELL or percent > OUTLIER.passed_percent else ""
+        reasons.append(f"{only}a change of the gain of {words(state)} above {number(percent, 2)} % would be detected")
+    if error := row.get("error"):
+        rms, bound = (f"{number(error[key])} {readable_unit(error['unit'])}".strip() for key in ("rms", "bound"))
+        reasons.append(f"error of {words(error['state'])} {rms}, at most {bound} expected")
     if "missing" in row:
         reasons.append(f"no score without {', '.join(row['missing'])}")
     elif row["status"] == Status.CANNOT_TELL:

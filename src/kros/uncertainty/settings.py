@@ -110,8 +110,10 @@ class OutlierRule:
     rounding_db: float = 1e-8  # levels are rounded to a tenth of that
     largest_db: float = 26.0  # beyond the largest of the others, twenty times as far away, at which a unit has to show
     largest_percent: float = 900.0  # change of gain, ten times as large, at which a unit has to show
-    percent: float = 1.0  # change of an entry from which the smallest change that shows is extrapolated
-    changed: int = 12  # units at most, whose entries are changed
+    percent: float = 1.0  # change of an output's gain from which the smallest change that shows is extrapolated
+    passed_percent: float = 100.0  # change of gain, twice as large, that a PASS excludes of every hidden state
+    failed: float = 2.0  # error of the deployed observer over its bound beyond which a unit fails; above one it is open
+    changed: int = 12  # units at most, whose gains are changed
     recorded: float = 0.5  # of the middle unit's samples: the variance of an estimate is at most twice the usual one
 
 

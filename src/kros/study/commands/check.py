@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from operator import itemgetter
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 
-from ...core import Array, ConfigError, DataError, Executor, Flags, plain
+from ...core import TINY, Array, ConfigError, DataError, Executor, Flags, plain
 from ...data import Population
 from ...data.recording import check_population
+from ...evaluate.held_out import HeldOut
 from ...identify import ModelSet
 from ...identify.calibration import Values, training_keys, unit_parameters
 from ...identify.factors import reduce_episodes
@@ -51,14 +53,14 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     observer = context.deployed if store.holds(*DEPLOYED) else None
     population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
-    watched = Rows()
+    watched, errors = Rows(), dict[tuple[str, str], Rows]()
     if observer is not None:
-        hidden = any(name not in population.states for name in observer.recorded)
-        if hidden or observer.monitor is not None:
-            watched = monitored(FieldRecordings.open(context, data))
-        if hidden:
+        recordings = FieldRecordings.open(context, data)
+        watched = monitored(recordings)
+        if any(name not in population.states for name in observer.recorded):
             return watched
         check_channels(population, observer)
+        errors = errors_beside_bounds(context, population, recordings.values)
     if not names:
         raise ConfigError(
             f"Run {store.folder}: has no outlier scores to compare with; run the study until quantify, with at least "
@@ -78,7 +80,38 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
         for name, models in known.items():
             outliers = OutlierModel.load(store.path("outliers", name))
             rows += score_condition(context, population, models, outliers, executor, same_unit)
-    return [row | levels.get((row["unit"], row["condition"]), {}) for row in rows]
+    for row in rows:
+        place = row["unit"], row["condition"]
+        row |= levels.get(place, {})
+        if beside := errors.get(place):
+            row["error"] = max(beside, key=itemgetter("ratio"))
+            gains = {e["state"]: e["gain_percent"] for e in beside}
+            row["detectable"] = {s: min(p, gains.get(s, np.inf)) for s, p in row["detectable"].items()}
+    return rows
+
+
+def errors_beside_bounds(context: Context, population: Population, values: Values) -> dict[tuple[str, str], Rows]:
+    """Return errors of the deployed observer in hidden states beside its bounds, by unit, in the models' condition.
+
+    A change of a state's gain that adds as much to the error as the bound is would be detected.
+    """
+    home, observer = context.facts.identify_on, context.deployed
+    bounds = context.observers_record["facts"].get(observer.name, {}).get("set_bound", {})
+    states = [name for name in hidden_states(observer) if bounds.get(name)]
+    if home not in population.conditions or not states:
+        return {}
+    episodes = HeldOut(population, population.keys(condition=home), values, sensor=context.config.sensor)
+    (outcome,) = episodes.observers([observer])
+    errors = dict[tuple[str, str], Rows]()
+    for (unit, _), keys in episodes.groups.items():
+        moves = np.sqrt(np.mean([population.read(key).var(axis=0) for key in keys], axis=0))
+        for name in states:
+            i, bound = population.states.index(name), bounds[name]
+            rms = float(np.mean([outcome.errors[key][i]["rms"] for key in keys]))
+            row = {"state": name, "rms": rms, "bound": bound, "ratio": rms / bound, "unit": population.channels[i].unit}
+            row["gain_percent"] = 100 * bound / max(float(moves[i]), TINY)
+            errors.setdefault((unit, home), Rows()).append(row)
+    return errors
 
 
 def score_condition(
@@ -114,7 +147,7 @@ def score_condition(
         (response,) = recorded.response([evidence])
         level = None if recorded.same_motions(factor) else motion
         score = recorded.qualified(outliers.score(unit, response, known, level), evidence)
-        row = score_row(score, condition, len(keys), float(factor.n_samples.sum()) * models.sample_period_s)
+        row = score_row(score, models, len(keys), float(factor.n_samples.sum()) * models.sample_period_s)
         rows.append(row | {"units": len(set(outliers.unit_ids) - known), "left_out": sorted(known)})
     return rows
 

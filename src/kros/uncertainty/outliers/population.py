@@ -47,7 +47,7 @@ def score_population(
             keys, used = (models.facts.keys(part, score.unit, condition) for part in ("test", "train"))
             held_out = 1 + len(keys) / len(used)  # episodes that are held out are as long as the others
             seconds = n_samples * scored[condition].sample_period_s * held_out
-            rows.append(score_row(score, condition, len(keys) + len(used), seconds))
+            rows.append(score_row(score, scored[condition], len(keys) + len(used), seconds))
     return found, rows
 
 
@@ -75,11 +75,13 @@ def score_condition(
     return replace(outliers, scores=qualified), [data.n_samples for data in evidence]
 
 
-def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
+def score_row(score: OutlierScore, models: ModelSet, episodes: int, recorded_s: float) -> dict[str, Any]:
     """Return a score as a row of metrics, with what was recorded and what is needed."""
-    same = ["outlier", "freq_hz", "excess_db", "lowest_db", "highest_db", "status", "detectable_hz", "fewest_units"]
-    row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db}
-    row |= {key: getattr(score, key) for key in same} | {"detectable": score.detectable_percent}
+    same = ["outlier", "freq_hz", "excess_db", "lowest_db", "highest_db", "status", "fewest_units"]
+    row = {"unit": score.unit, "condition": models.condition, "score": score.score_db, "threshold": score.threshold_db}
+    states = dict(zip(models.lifting.states, score.detectable_percent, strict=False))
+    hidden = [name for i, name in enumerate(states) if i not in models.measured] or list(states)
+    row |= {key: getattr(score, key) for key in same} | {"detectable": {name: states[name] for name in hidden}}
     return row | {"episodes": episodes, "recorded_s": recorded_s, "needed_s": recorded_s * score.more_data}
 
 

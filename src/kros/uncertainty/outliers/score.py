@@ -56,8 +56,7 @@ class OutlierScore:
     lowest_db: float  # range of the excess over all choices of one nominal unit
     highest_db: float
     status: Status = Status.CANNOT_TELL
-    detectable_percent: float = float("inf")  # smallest change of gain of one entry that would be flagged, first order
-    detectable_hz: float | None = None  # where that is; None where nothing could be flagged
+    detectable_percent: tuple[float, ...] = ()  # of each output: smallest change of its gain that would be flagged
     more_data: float = 1.0  # how many times as long the unit would have to be recorded; one where recordings suffice
     fewest_units: int | None = None  # that would decide, were they as unlike as these; none where no number would
 
@@ -66,9 +65,9 @@ class OutlierScore:
 class Comparison:
     """Units and their distances; units are scored against the inliers among them.
 
-    Beside a score stands the smallest change of a unit that it would have shown. One entry of a unit's response,
-    changed by one percent, is a residual of some level at every frequency; a level is proportional to the change to
-    first order, so what it takes to reach the bound follows in percent.
+    Beside a score stands the smallest change of each output's gain that it would have shown. An output that is one
+    percent larger is a residual of some level at every frequency; a level is proportional to the change to first
+    order, so what it takes to reach the bound follows in percent.
     """
 
     form: Form
@@ -93,12 +92,10 @@ class Comparison:
         return tuple(scores)
 
     def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:
-        """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
+        """Return a score with the smallest changes of gains that are an excess of the bound, and what follows."""
         cover = float(self.distances.levels[unit].max()) - score.excess_db
         percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
-        percent = percent.min(axis=(0, 1))
-        smallest, hz = float(percent.min()), float(self.freqs_hz[percent.argmin()])
-        largest = min(OUTLIER.largest_db, bound_db + 20 * np.log10(OUTLIER.largest_percent / smallest))
+        largest = min(OUTLIER.largest_db, bound_db + 20 * np.log10(OUTLIER.largest_percent / percent.min()))
         share = factor(int(self.inliers.sum() - self.inliers[unit]), self.rate) * largest / bound_db
         enough = OUTLIER.fewest + bisect_left(
             range(OUTLIER.fewest, int(1 / self.rate)), True, key=lambda n: factor(n, self.rate) <= share
@@ -108,17 +105,13 @@ class Comparison:
             return score
         inlier = Status.OK if bound_db <= largest else Status.CANNOT_TELL
         status = Status.OUTLIER if score.outlier else inlier
-        return replace(score, status=status, detectable_percent=smallest, detectable_hz=hz)
+        return replace(score, status=status, detectable_percent=tuple(percent.tolist()))
 
     @cached_property
     def _changes(self) -> AnyArray:
-        """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
+        """Largest levels, dB, of residuals between inliers and themselves with one output changed, shape (p,)."""
         G = self.responses[self.inliers]
         G = G[evenly(len(G), OUTLIER.changed)]
-        levels = np.empty((*G.shape[2:], G.shape[1]))
-        for i, j in np.ndindex(*G.shape[2:]):
-            changed = G.copy()
-            changed[:, :, i, j] *= 1 + OUTLIER.percent / 100
-            shifted = scaled_levels(self.form, G, changed, self.distances, self.freqs_hz)
-            levels[i, j] = np.median(shifted, axis=0)
-        return levels
+        rows = 1 + OUTLIER.percent / 100 * np.eye(G.shape[2])
+        levels = [scaled_levels(self.form, G, G * row[:, None], self.distances, self.freqs_hz) for row in rows]
+        return np.median(levels, axis=1).max(axis=1)

@@ -101,6 +101,47 @@ def test_every_reason_sets_the_status_and_leads_to_its_section(
     assert "can be deployed" not in found.sentence
 
 
+def test_a_unit_with_several_times_the_error_of_the_others_is_named_with_its_error_and_ratio() -> None:
+    """Not named: a unit of twice their error, one that moved less and has the same error, one of three of a pair."""
+    units = {"a": 0.2, "b": 0.22, "c": 0.18, "d": 0.44, "bad": 1.2}
+    rows = [row(NAME, percent, unit) for unit, percent in units.items()] + [row("koopman/open_loop", 9.0)]
+    text = "Units with several times the error of the others: bad has 1.20 % in velocity, 5.7 times their median."
+    assert [r.text for r in judge(Facts(metrics(evaluation=rows))).reasons] == [text]
+    nominal = [r | {"role": "nominal"} if r["unit"] == "bad" else r for r in rows]
+    assert [r.text for r in judge(Facts(metrics(evaluation=nominal))).reasons] == [text]
+    slow = [r | {"rms": 0.004} if r["unit"] == "bad" else r for r in rows]
+    few = [r for r in rows if r["unit"] in ("a", "bad")]
+    aside = [r | {"role": "outlier"} if r["unit"] == "bad" else r for r in rows]
+    for others in (slow, few, aside):
+        assert judge(Facts(metrics(evaluation=others))).status is Status.READY
+
+
+def test_a_rival_that_is_better_in_one_hidden_state_is_named_with_the_state() -> None:
+    means = {
+        NAME: (16.0, 8.0),
+        "learned": (12.0, 10.6),
+        "filtered_difference": (12.3, None),
+        "linear/mixed": (20.0, 7.0),
+    }
+    rows = [
+        row(name, percent, channel=channel)
+        for name, of in means.items()
+        for channel, percent in zip(("velocity", "force"), of, strict=True)
+        if percent
+    ]
+    texts = [r.text for r in judge(Facts(metrics(evaluation=rows))).reasons if "smaller errors" in r.text]
+    assert texts == [
+        "“learned” has smaller errors of velocity.",
+        "“linear, mixed H2-H∞” has smaller errors of force.",
+    ]
+
+
+def test_a_bound_that_a_unit_exceeds_says_so_where_it_stands() -> None:
+    rows = [row(NAME, 0.1), row(NAME, 0.2, "c"), row(NAME, 0.3, "d"), row("koopman/open_loop", 9.0)]
+    (text, _) = judge(Facts(metrics(observers={NAME: BOUND}, evaluation=rows))).certified
+    assert "the RMS error is at most 0.00300 rad/s in velocity (exceeded by unit d, c); about one new unit" in text
+
+
 def test_ready_means_that_it_can_be_deployed_and_voids_stand_beside() -> None:
     found = judge(Facts(metrics()))
     assert found.status is Status.READY
@@ -204,7 +245,7 @@ def test_a_channel_without_a_unit_has_numbers_alone() -> None:
     rows = [row(NAME, 0.2, channel="force"), row("koopman/open_loop", 0.9, channel="force")]
     verdict = judge(Facts(metrics(observers={NAME: entry}, evaluation=rows)))
     assert verdict.reasons[0].text.endswith("force of unit b has 0.00400, expected were 0.00300.")
-    assert "is at most 0.00300 in force;" in verdict.certified[0]
+    assert "is at most 0.00300 in force (exceeded by unit b);" in verdict.certified[0]
     assert verdict.numbers[0].notes[0] == "RMS 0.00400"
 
 

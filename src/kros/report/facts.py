@@ -27,11 +27,25 @@ class ErrorCell:
     """Error of an observer in a channel, percent of the largest value; None where an estimate diverged."""
 
     means: Mapping[str, float] = field(default_factory=dict)  # over units, of what all have, by its key in the metrics
-    worst: float | None = None
-    worst_unit: str | None = None
-    worst_rms: float | None = None
+    errors: Mapping[str, float] = field(default_factory=dict)  # by unit
+    rms: Mapping[str, float] = field(default_factory=dict)  # by unit, in the channel's unit of measure
     interval: Sequence[float] = ()  # 95 % interval of the mean, by a bootstrap over units
     diverged: int = 0  # units whose estimate diverged
+
+    @property
+    def worst_unit(self) -> str | None:
+        """Unit of the largest error."""
+        return max(self.errors, key=self.errors.__getitem__, default=None)
+
+    @property
+    def worst(self) -> float | None:
+        """Largest error of a unit."""
+        return max(self.errors.values(), default=None)
+
+    @property
+    def worst_rms(self) -> float | None:
+        """Largest RMS error of a unit."""
+        return max(self.rms.values(), default=None)
 
     @property
     def mean(self) -> float | None:
@@ -71,12 +85,11 @@ def _cell(rows: Sequence[Any], interval: Sequence[float]) -> ErrorCell:
     lost = len({r["unit"] for r in rows if r["error_percent"] is None})
     if lost:
         return ErrorCell(diverged=lost)
-    worst = max(rows, key=itemgetter("error_percent"))
     numbers = (key for key, value in rows[0].items() if not isinstance(value, str))
     known = {key: values for key in numbers if None not in (values := [r.get(key) for r in rows])}
     means = {key: float(np.mean(values)) for key, values in known.items()}
-    worst_rms = max(known.get("rms", ()), default=None)
-    return ErrorCell(means, float(worst["error_percent"]), worst["unit"], worst_rms, interval)
+    errors, rms = ({r["unit"]: r[key] for r in rows if r.get(key) is not None} for key in ("error_percent", "rms"))
+    return ErrorCell(means, errors, rms, interval)
 
 
 @frozen

@@ -9,11 +9,13 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 from operator import itemgetter
 
-from ..core import ByName, frozen, grouped
+import numpy as np
+
+from ..core import TINY, ByName, frozen, grouped
 from ..data import some
 from ..design.task import split_name
 from .facts import ErrorCell, ErrorTable, Facts
-from .names import condition_label, joined, label_of, number, observer_label, words
+from .names import condition_label, in_condition, joined, label_of, number, observer_label, words
 
 Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the section with the details
 
@@ -22,9 +24,10 @@ Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the se
 class Thresholds:
     """From where on a difference is a reason to check."""
 
-    better: float = 0.05  # share by which all mean errors of another observer are smaller
+    better: float = 0.05  # share by which mean errors of another observer are smaller
     improved: float = 0.01  # share by which a correction must reduce the error of the model alone
     large: float = 0.1  # mean error of a hidden channel, share of its largest value
+    several: float = 3.0  # error of a unit in a hidden channel over the median of the others; of good ones up to 2.9
     noise: float = 0.5  # share of estimation noise in the largest difference between units
 
 
@@ -177,7 +180,7 @@ def _of_recordings(facts: Facts) -> Checks:
 
 
 def _of_units(facts: Facts) -> Checks:
-    """Yield units that are flagged, undecided or have a remark."""
+    """Yield units that are flagged, undecided, have a remark, or several times the error of the others."""
     rows = facts.get("outliers")
     if flagged := [r for r in rows if r["outlier"]]:
         text = f"Flagged as not belonging to the batch: {units_text(flagged)}."
@@ -191,6 +194,30 @@ def _of_units(facts: Facts) -> Checks:
         yield _inconclusive(few, rows), action, "units"
     if remarks := [f"{r['unit']} ({r['status']})" for r in facts.get("units") if r.get("status", "ok") != "ok"]:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
+    if unlike := units_of_large_errors(facts):
+        text = f"Units with several times the error of the others: {some(unlike)}."
+        yield (
+            text,
+            "Inspect these units; leave them out if they are defective, since they make the observer worse.",
+            "units",
+        )
+
+
+def units_of_large_errors(facts: Facts) -> list[str]:
+    """Return units whose error in a hidden channel, relative and absolute, is far above the median of the others."""
+    units = [r for r in facts.get("evaluation") if r["observer"] == facts.deployed and r["role"] != "outlier"]
+    rows = [r for r in units if r["channel"] in facts.hidden and r["error_percent"] is not None]
+    texts = []
+    for (condition, channel), of in grouped(rows, itemgetter("condition", "channel")).items():
+        for row in of if len(of) > 2 else ():
+            others = [r for r in of if r is not row]
+            medians = {key: max(float(np.median([r[key] for r in others])), TINY) for key in ("error_percent", "rms")}
+            ratio = min(row[key] / median for key, median in medians.items())
+            if ratio >= THRESHOLDS.several:
+                place = f"{row['unit']}{in_condition(condition)}"
+                error = f"{number(row['error_percent'])} % in {words(channel)}"
+                texts.append(f"{place} has {error}, {number(ratio, 2)} times their median")
+    return texts
 
 
 def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
@@ -204,13 +231,15 @@ def _of_errors(facts: Facts) -> Checks:
     """Yield better observers, channels without improvement, and bounds that errors exceed."""
     table, hidden = facts.table, facts.hidden
     ratio, others = 1 - THRESHOLDS.better, [name for name in table.cells if name != facts.deployed]
-    if rivals := [name for name in others if _smaller(table, name, facts.deployed, hidden, ratio)]:
-        better = min(rivals, key=lambda name: table.mean(name, hidden))  # the most accurate one
-        text = f"“{observer_label(better)}” has smaller errors in all hidden channels."
-        designed = "relift_certified" in facts.observers.get(better, {})
-        export = f"`kros export c --observer {better}` exports it."
+    better = {n: [c for c in hidden if _smaller(table, n, facts.deployed, [c], ratio)] for n in others}
+    ranked = sorted(others, key=lambda name: (-len(better[name]), table.mean(name, better[name])))
+    best = [next((name for name in ranked if c in better[name]), None) for c in hidden]
+    for name in dict.fromkeys(filter(None, best)):
+        where = "in all hidden channels" if better[name] == hidden else f"of {channels(better[name])}"
+        designed = "relift_certified" in facts.observers.get(name, {})
+        export = f"`kros export c --observer {name}` exports it."
         action = export if designed else "It is a baseline that is not exported."
-        yield text, f"Compare both. {action}", "errors"
+        yield f"“{observer_label(name)}” has smaller errors {where}.", f"Compare both. {action}", "errors"
     same = not_improved(facts)
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."
@@ -219,12 +248,17 @@ def _of_errors(facts: Facts) -> Checks:
         each = joined([f"{words(c)} ({number(e)} % of the largest value)" for c, e in large.items()])
         yield f"The error is large: {each}.", "Measure another signal, or use the estimate for trends alone.", "errors"
     for channel, bound in (facts.entry.get("set_bound") or {}).items():
-        cell = facts.cells.get(channel, ErrorCell())
-        if cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
+        if exceeding := _exceeding(facts, channel, bound):
             text = f"A held-out episode exceeds the largest RMS error expected: {words(channel)} of unit "
-            expected = facts.quantity(channel, bound)
-            text += f"{cell.worst_unit} has {facts.quantity(channel, cell.worst_rms)}, expected were {expected}."
+            rms, expected = (facts.quantity(channel, v) for v in (facts.cells[channel].worst_rms, bound))
+            text += f"{exceeding[0]} has {rms}, expected were {expected}."
             yield text, "Do not rely on this number; record more kinds of episodes.", "certificates"
+
+
+def _exceeding(facts: Facts, channel: str, bound: float | None) -> list[str]:
+    """Return units whose RMS error on held-out episodes exceeds a bound, the largest first."""
+    rms = facts.cells.get(channel, ErrorCell()).rms
+    return sorted((u for u in rms if bound is not None and rms[u] > bound), key=rms.__getitem__, reverse=True)
 
 
 def _of_certificates(facts: Facts) -> Checks:
@@ -266,7 +300,9 @@ def certificates(facts: Facts) -> list[str]:
     bounds = {c: b for c, b in (entry.get("set_bound") or {}).items() if b is not None and entry.get("set_certified")}
     hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
     if hidden:
-        parts = [f"{facts.quantity(c, bounds[c])} in {words(c)}" for c in hidden]
+        exceeded = {c: some(_exceeding(facts, c, bounds[c])) for c in hidden}
+        notes = {c: f" (exceeded by unit {units})" for c, units in exceeded.items() if units}
+        parts = [f"{facts.quantity(c, bounds[c])} in {words(c)}{notes.get(c, '')}" for c in hidden]
         bank = split_name(facts.deployed)[1] == "estimator"
         source = "Measured on units left out of its regression" if bank else "For recorded signals"
         share = f"; about one new unit in {facts.study['units'] + 1} exceeds it" if bank else ""

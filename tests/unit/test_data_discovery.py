@@ -313,3 +313,27 @@ def test_the_rate_is_found_from_times_that_are_rounded(tmp_path: Path):
         (tmp_path / unit).mkdir(exist_ok=True)
         np.savetxt(tmp_path / unit / f"{run}.csv", values, "%.2f", ",", header="time,angle,speed,voltage", comments="")
     assert any("resampled to a period of 0.0167 s" in text for text in discover(tmp_path).findings)  # not 0.02 s
+
+
+@pytest.mark.parametrize(
+    ("header", "wanted", "findings"),
+    [
+        ("t [s],angle,speed,voltage,throttle", Wanted(), ["left out: throttle; name an --input or --measured"]),
+        ("t,angle,speed,voltage,current", Wanted(), ["a step of 5 looks like ms: correct it if it is not"]),
+        ("t [s],angle,speed,voltage,throttle", Wanted(inputs=("throttle",)), []),
+        (
+            "t [s],angle,flow,voltage,throttle",
+            Wanted(inputs=("flow",)),
+            ["states to estimate: throttle; name an --input or --measured"],
+        ),
+    ],
+)
+def test_what_is_guessed_or_not_recognised_is_reported(
+    tmp_path: Path, header: str, wanted: Wanted, findings: list[str]
+) -> None:
+    """A time without a unit in steps of five, and a column whose name says nothing."""
+    for name, lines in recordings().items():
+        rows = [f"{5 * k},{line.partition(',')[2]},{k % 9}" for k, line in enumerate(lines[2:])]
+        written(tmp_path, {name: [header, *rows]})
+    found = discover(tmp_path, wanted).findings
+    assert [text.endswith(end) for text, end in zip(found, findings, strict=True)] == [True] * len(findings)

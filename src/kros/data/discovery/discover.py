@@ -71,6 +71,7 @@ def discover(source: Path, wanted: Wanted | None = None, work: Work | None = Non
     alone = f"{len(strange)} files are not like the others and left alone: {some(list(strange))}"
     findings = [f"{alone}; the first {next(iter(strange.values()))}"] if strange else []
     findings += [f"left out, {name}: {why}" for name, why in damaged.items()]
+    findings += _doubted(columns, keys.get("time_scale", 1.0), notes)
     unused = [name for name in (*strange, *damaged) if re.search(mapping["files"], name)]
     draft = Discovery(mapping, (), tuple(columns), population, notes, tuple(findings))
     found = _examined(source, draft, unused, fewest, work)
@@ -220,6 +221,15 @@ def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn
     if any(c.part is ColumnPart.STATE for c in decided):
         return decided
     return [replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided]  # to be estimated
+
+
+def _doubted(columns: Sequence[TableColumn], time_scale: float, notes: Mapping[str, str]) -> list[str]:
+    """Return sentences about a guessed unit of time other than seconds, and about columns that are not recognised."""
+    guess = [f"time_scale = {time_scale:g}: {notes['time_scale']}"] if time_scale != 1 else []
+    for part, what in ((ColumnPart.LEFT_OUT, "left out"), (ColumnPart.STATE, "taken for states to estimate")):
+        if unknown := [c for c in columns if c.part is part and c.why == UNKNOWN]:
+            guess.append(f"columns that move, not recognised, {what}: {_names(unknown)}; name an --input or --measured")
+    return guess
 
 
 def _named(columns: Sequence[TableColumn], name: str) -> TableColumn:

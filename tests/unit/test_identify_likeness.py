@@ -32,8 +32,36 @@ def test_a_batch_with_spread_is_not_doubted(motors) -> None:
 def test_another_sign_and_another_unit_of_measure_are_named(motors, name: str) -> None:
     one, other = motors.unit_ids[1], motors.unit_ids[3]
     against, size = alerts(motors, {(one, name): -1.0, (other, name): np.pi / 180})
-    assert against == f"Unit {one}: {name} moves against other channels, unlike in most units; check its sign."
+    assert against == f"Unit {one}: {name} moves against the other channels, unlike in most; check its sign."
     assert size.startswith(f"Unit {other}: {name} moves 0.01")
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "current", "voltage"])
+def test_one_mirrored_episode_of_a_unit_is_named_with_its_channel(motors, name: str) -> None:
+    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+    data[motors.unit_ids[1]][1][:, [c.name for c in motors.channels].index(name)] *= -1
+    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
+    (alert,) = kros.identify(
+        kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s), refine=False
+    ).facts.alerts
+    episode = f"Episode 1 of unit {motors.unit_ids[1]} (default)"
+    assert alert == f"{episode}: {name} moves against the other channels, unlike in most; check its sign."
+
+
+def test_a_motion_that_turns_a_correlation_in_every_unit_is_no_mirrored_channel() -> None:
+    """One of four episodes is above the resonance: there the force is against the position, in all units but one."""
+    t = np.arange(400) * 0.05
+    motions = [
+        np.column_stack([np.sin(f * t) / (1 - f**2), f * np.cos(f * t) / (1 - f**2)]) for f in (0.3, 0.4, 0.5, 3)
+    ]
+    episodes = [np.column_stack([x, np.sin(f * t)]) for f, x in zip((0.3, 0.4, 0.5, 3), motions, strict=True)]
+    units = {unit: {f"{k}": moments(values) for k, values in enumerate(episodes)} for unit in "abcde"}
+    units["a"]["3"] = units["a"]["2"]
+    channels = ["position", "velocity", "force"]
+    assert unlike(channels, units) == []
+    units["b"]["1"] = moments(episodes[1] * (1, -1, 1))
+    expected = "1: position or velocity moves against the other channels, unlike in most; check its sign."
+    assert unlike(channels, units) == [expected]
 
 
 def test_a_sensor_that_fails_for_a_while_is_named_with_its_episode(motors) -> None:
@@ -56,7 +84,7 @@ def test_moments_are_covariances_of_channels_and_changes() -> None:
     values = np.random.default_rng(0).normal(size=(50, 2)).cumsum(axis=0)
     wide = np.hstack([values[1:], values[1:] - values[:-1]])
     np.testing.assert_allclose(moments(values), (wide - wide.mean(axis=0)).T @ (wide - wide.mean(axis=0)) / 49)
-    assert unlike(["a", "b", "c"], ["x", "rest"], [np.diag([1.0, 0, 1, 0])] * 3) == []
+    assert unlike(["x", "rest"], {unit: {"run": np.diag([1.0, 0, 1, 0])} for unit in "abc"}) == []
 
 
 @pytest.mark.parametrize("resting", [0.0, 1e-20])
@@ -64,4 +92,5 @@ def test_a_channel_that_rests_in_one_unit_or_in_most_has_no_unit_of_measure(rest
     moving = np.eye(4)
     still = np.diag([1.0, resting, 1.0, resting]) ** 2
     for units in ([moving, moving, moving, still], [moving, still, still, still]):
-        assert unlike("abcd", ["position", "brake"], units) == []
+        episodes = {unit: {"run": moment} for unit, moment in zip("abcd", units, strict=True)}
+        assert unlike(["position", "brake"], episodes) == []

@@ -34,6 +34,7 @@ class CheckRule:
     # to the median unit, from which on the size of a channel is doubted; half its logarithm beside the other channels
     ratio: float = 8.0
     correlation: float = 0.5  # of channels, from which on its sign counts
+    usual: float = 0.9  # share of the middle unit's episodes in which a correlation has its sign, to be a usual one
     held: float = 0.2  # share of an episode in which a state stays the same, from which on its sensor is doubted
     jump: float = 2.0  # change of a state between two samples, in ranges of most of them, beyond which it is doubted
     constant: float = ROUNDING  # of the largest value: what filters and scales make of a constant

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -46,27 +46,59 @@ def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> lis
     return [f"{episodes[i]}: {channels[k]} {what}; if its sensor failed, leave it out." for i, k, what in found]
 
 
-def unlike(units: Sequence[str], channels: Sequence[str], covariances: Sequence[Array]) -> list[str]:
-    """Return a sentence for every channel of a unit whose size, or whose sign, is not that of most units."""
-    G, c = np.array(covariances), len(channels)
-    size = np.sqrt(np.maximum(np.diagonal(G, axis1=1, axis2=2), TINY))
-    correlation = G / size[:, :, None] / size[:, None]
-    moved = size[:, :c]
+def unlike(channels: Sequence[str], units: Mapping[str, Mapping[str, Array]]) -> list[str]:
+    """Return a sentence for every channel of a unit whose size, or whose sign in episodes, is not that of most units.
+
+    Units have the moments of their episodes, by the titles of these.
+    """
+    covariances, c = [np.array(list(of.values())) for of in units.values()], len(channels)
+    moved = np.array([_sizes(G.mean(axis=0))[:c] for G in covariances])
     most = np.median(moved, axis=0)
     ratio = moved / most
     log, far = np.log(ratio), np.log(CHECK.ratio)
     beside = log - np.median(log, axis=1, keepdims=True)  # other channels of the unit: it may have been moved less
     moves = np.minimum(moved, most) > ROUNDING * moved.max(axis=0)  # what rests has no unit of measure
     apart = moves & (np.abs(log) > far) & (np.abs(beside) > far / 2)
-    sure = np.abs(correlation) > CHECK.correlation
-    usual = np.median(correlation, axis=0)
-    opposite = sure & (np.abs(usual) > CHECK.correlation) & (correlation * usual < 0)
     found = []
-    for i, unit in enumerate(units):
+    for i, ((unit, episodes), mirrored) in enumerate(zip(units.items(), _mirrored(covariances, c), strict=True)):
         for k in np.flatnonzero(apart[i]).tolist():
             times = f"{channels[k]} moves {ratio[i, k]:.3g} times as much as in most units"
             found.append(f"Unit {unit}: {times}; check its unit of measure.")
-        if opposite[i].any():
-            name = channels[int(opposite[i].sum(axis=0).argmax()) % c]
-            found.append(f"Unit {unit}: {name} moves against other channels, unlike in most units; check its sign.")
+        names = {
+            title: " or ".join(channels[k] for k in of) for title, of in zip(episodes, mirrored, strict=True) if of
+        }
+        if 2 * len(names) > len(episodes):  # most of them: the unit's sensor
+            names = {f"Unit {unit}": name for name in names.values()}
+        found += [
+            f"{what}: {name} moves against the other channels, unlike in most; check its sign."
+            for what, name in names.items()
+        ]
     return found
+
+
+def _mirrored(units: Sequence[Array], c: int) -> list[list[list[int]]]:
+    """Return the channels of every episode of units, (episode, 2 c, 2 c), whose correlations have mostly changed sign.
+
+    Usual correlations count. A correlation is usual if it has the same sign in nearly all episodes of most units.
+    """
+    sizes = [_sizes(G) for G in units]
+    least = np.median(np.concatenate(sizes), axis=0) / CHECK.ratio  # what moves less than that may be noise
+    correlations = [
+        np.where((size > least)[:, :, None] & (size > least)[:, None], G / size[:, :, None] / size[:, None], 0.0)
+        for G, size in zip(units, sizes, strict=True)
+    ]
+    sign = np.sign(np.median([np.median(r, axis=0) for r in correlations], axis=0))
+    signed = [r * sign for r in correlations]
+    usual = np.median([(r > CHECK.correlation).mean(axis=0) for r in signed], axis=0) >= CHECK.usual
+    usual &= np.arange(2 * c)[:, None] % c != np.arange(2 * c) % c
+    channels = []
+    for r in signed:
+        changed = np.where(usual, (r < -CHECK.correlation) * 1.0 - (r > CHECK.correlation), 0.0)
+        excess = changed.sum(axis=2).reshape(-1, 2, c).sum(axis=1)
+        channels.append([np.flatnonzero((of > 0) & (of == of.max())).tolist() for of in excess])
+    return channels
+
+
+def _sizes(G: Array) -> Array:
+    """Return the standard deviations of covariances (..., k, k), shape (..., k)."""
+    return np.sqrt(np.maximum(np.diagonal(G, axis1=-2, axis2=-1), TINY))

@@ -90,6 +90,7 @@ class _EpisodeFacts:
     digest: str
     n_samples: int
     course: Array  # of the states, see `likeness`
+    moments: Array  # see `likeness`
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,6 @@ class _GroupFacts:
     written: str | None
     resolution: dict[str, float]
     episodes: list[_EpisodeFacts]
-    moments: Array  # mean over the episodes, see `likeness`
 
 
 @dataclass(frozen=True)
@@ -202,12 +202,12 @@ def _facts(
 
 def _unlike(population: Population, read: Sequence[_GroupFacts], units: Collection[str]) -> list[str]:
     """Return what is said about units whose recordings are unlike those of most, in any condition."""
-    by_condition: dict[str, dict[str, Array]] = {}
+    by_condition: dict[str, dict[str, dict[str, Array]]] = {}
     for group in read:
         if group.episodes and (key := group.episodes[0].key).unit in units:
-            by_condition.setdefault(key.condition, {})[key.unit] = group.moments
+            by_condition.setdefault(key.condition, {})[key.unit] = {title(e.key): e.moments for e in group.episodes}
     names, several = [c.name for c in population.channels], [of for of in by_condition.values() if len(of) > 2]
-    return list(dict.fromkeys(text for of in several for text in unlike(list(of), names, list(of.values()))))
+    return list(dict.fromkeys(text for of in several for text in unlike(names, of)))
 
 
 def check_usable(
@@ -237,15 +237,13 @@ def _read_group(task: _Group) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
     population, record, written = task.population, None, None
     names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
-    covariances = list[Array]()
 
     def episodes_in_turn() -> Iterator[tuple[EpisodeKey, Array, str]]:
         for key, values, digest in usable_episodes(population, task.on_nan):
             if not episodes:
                 resolution.update(_resolution(population, key, values))
             of_states = course(values[:, : len(names)])[:, : len(population.states)]
-            episodes.append(_EpisodeFacts(key, digest, len(values), of_states))
-            covariances.append(moments(values[:, : len(names)]))
+            episodes.append(_EpisodeFacts(key, digest, len(values), of_states, moments(values[:, : len(names)])))
             yield key, values, digest
 
     if task.folder is None:
@@ -253,7 +251,7 @@ def _read_group(task: _Group) -> _GroupFacts:
     else:
         record = write_group(population, task.folder, episodes_in_turn())
         written = file_digest(task.folder / record.file)
-    return _GroupFacts(record, written, resolution, episodes, np.mean(covariances, axis=0))
+    return _GroupFacts(record, written, resolution, episodes)
 
 
 def _resolution(population: Population, key: EpisodeKey, prepared: Array) -> dict[str, float]:

@@ -28,6 +28,7 @@ class Thresholds:
     improved: float = 0.01  # share by which a correction must reduce the error of the model alone
     large: float = 0.1  # mean error of a hidden channel, share of its largest value
     several: float = 3.0  # error of a unit in a hidden channel over the median of the others; of good ones up to 2.9
+    compared: int = 5  # units, from which on their errors are compared: the median bears two that are unlike the others
     noise: float = 0.5  # share of estimation noise in the largest difference between units
 
 
@@ -209,7 +210,7 @@ def units_of_large_errors(facts: Facts) -> list[str]:
     rows = [r for r in units if r["channel"] in facts.hidden and r["error_percent"] is not None]
     texts = []
     for (condition, channel), of in grouped(rows, itemgetter("condition", "channel")).items():
-        for row in of if len(of) > 2 else ():
+        for row in of if len(of) >= THRESHOLDS.compared else ():
             others = [r for r in of if r is not row]
             medians = {key: max(float(np.median([r[key] for r in others])), TINY) for key in ("error_percent", "rms")}
             ratio = min(row[key] / median for key, median in medians.items())

@@ -63,7 +63,8 @@ def with_verdict(row: Record) -> Record:
     verdict = Verdict.PASS if row["status"] == Status.OK and within else Verdict.UNDECIDED
     beyond = error and row["units"] >= FEWEST_UNITS and (ratio is None or ratio > OUTLIER.failed)
     verdict = Verdict.FAIL if row["outlier"] or beyond else verdict
-    return row | {"verdict": verdict, "reason": "; ".join(_reasons(row))}
+    row = row | {"verdict": verdict}
+    return row | {"reason": "; ".join(_reasons(row))}
 
 
 def by_unit(rows: Sequence[Record]) -> dict[str, tuple[Verdict, list[str]]]:
@@ -128,7 +129,7 @@ def _reasons(row: Record) -> list[str]:
     elif row["status"] == Status.OTHER_MOTIONS:
         less = "beyond the others, but by no more than one unit differs from motion to motion"
         reasons.append(f"{less}; repeat the motions of the study")
-    elif (gains := row.get("detectable")) and not row["outlier"]:
+    elif (gains := row.get("detectable")) and row["verdict"] is not Verdict.FAIL:
         state, percent = max(gains.items(), key=itemgetter(1))
         only = "only " if row["status"] == Status.CANNOT_TELL or percent > OUTLIER.passed_percent else ""
         reasons.append(f"{only}a change of the gain of {words(state)} above {number(percent, 2)} % would be detected")

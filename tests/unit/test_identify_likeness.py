@@ -48,6 +48,16 @@ def test_one_mirrored_episode_of_a_unit_is_named_with_its_channel(motors, name: 
     assert alert == f"{episode}: {name} moves against the other channels, unlike in most; check its sign."
 
 
+def test_one_episode_with_swapped_columns_is_named(motors) -> None:
+    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+    swapped = data[motors.unit_ids[1]][1]
+    swapped[:, [1, 2]] = swapped[:, [2, 1]]
+    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
+    found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)
+    alerts = kros.identify(found, refine=False).facts.alerts
+    assert any(a.startswith(f"Episode 1 of unit {motors.unit_ids[1]} (default): current moves ") for a in alerts)
+
+
 def test_a_motion_that_turns_a_correlation_in_every_unit_is_no_mirrored_channel() -> None:
     """One of four episodes is above the resonance: there the force is against the position, in all units but one."""
     t = np.arange(400) * 0.05

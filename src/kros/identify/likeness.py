@@ -47,9 +47,9 @@ def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> lis
 
 
 def unlike(channels: Sequence[str], units: Mapping[str, Mapping[str, Array]]) -> list[str]:
-    """Return a sentence for every channel of a unit whose size, or whose sign in episodes, is not that of most units.
+    """Return a sentence for every channel of a unit whose size, or whose sign, is not that of most units.
 
-    Units have the moments of their episodes, by the titles of these.
+    Units have the moments of their episodes, by the titles of these. If it is so in some episodes, these are named.
     """
     covariances, c = [np.array(list(of.values())) for of in units.values()], len(channels)
     moved = np.array([_sizes(G.mean(axis=0))[:c] for G in covariances])
@@ -62,17 +62,19 @@ def unlike(channels: Sequence[str], units: Mapping[str, Mapping[str, Array]]) ->
     found = []
     for i, ((unit, episodes), mirrored) in enumerate(zip(units.items(), _mirrored(covariances, c), strict=True)):
         for k in np.flatnonzero(apart[i]).tolist():
-            times = f"{channels[k]} moves {ratio[i, k]:.3g} times as much as in most units"
-            found.append(f"Unit {unit}: {times}; check its unit of measure.")
+            times = dict(zip(episodes, _sizes(covariances[i])[:, k] / most[k], strict=True))
+            sizes = {title: of for title, of in times.items() if abs(np.log(of)) > far}
+            if not 0 < 2 * len(sizes) <= len(episodes):
+                sizes = {f"Unit {unit}": ratio[i, k]}
+            much = "times as much as in most units; check its column and unit of measure."
+            found += [f"{what}: {channels[k]} moves {of:.3g} {much}" for what, of in sizes.items()]
         names = {
             title: " or ".join(channels[k] for k in of) for title, of in zip(episodes, mirrored, strict=True) if of
         }
         if 2 * len(names) > len(episodes):  # most of them: the unit's sensor
             names = {f"Unit {unit}": name for name in names.values()}
-        found += [
-            f"{what}: {name} moves against the other channels, unlike in most; check its sign."
-            for what, name in names.items()
-        ]
+        against = "moves against the other channels, unlike in most; check its sign."
+        found += [f"{what}: {name} {against}" for what, name in names.items()]
     return found
 
 

@@ -306,7 +306,8 @@ def certificates(facts: Facts) -> list[str]:
         parts = [f"{facts.quantity(c, bounds[c])} in {words(c)}{notes.get(c, '')}" for c in hidden]
         bank = split_name(facts.deployed)[1] == "estimator"
         source = "Measured on units left out of its regression" if bank else "For recorded signals"
-        share = f"; about one new unit in {facts.study['units'] + 1} exceeds it" if bank else ""
+        which = "each" if len(hidden) > 1 else "it"
+        share = f"; about one new unit in {facts.study['units'] + 1} exceeds {which}" if bank else ""
         texts.append(f"{source}: the RMS error is at most {joined(parts)}{share}.")
     if entry.get("relift_certified"):
         gain = number(entry.get("relift_gain"))

@@ -151,7 +151,7 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
 
 
 def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
-    """Return the samples in which a start is forgotten, by the slowest mode of the linear part or of a bank's filters."""
+    """Return the samples in which a start is forgotten, by the slowest mode of a linear part or of a bank's filters."""
     n, r, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted
     radius = float(spectral_radius(observer.one_step[:, [*range(n), *range(nl, nl + r)]]))
     if observer.bank is not None:

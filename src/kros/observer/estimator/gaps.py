@@ -114,7 +114,7 @@ def with_gaps(
 def distances(
     observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]
 ) -> tuple[Array, Array]:
-    """Return by which matrix distances from estimates of inputs alone decay, and their RMS; `held` go on as they are."""
+    """Return by which matrix distances from estimates of inputs alone decay, and their RMS; `held` have no decay."""
     n, at = len(observer.recorded), list(observer.measured)
     _, states, y, inputs, own = training(observer, recordings, settings.gap_samples, settings.gap_episodes)
     from_inputs = recorded_estimates(observer, y, inputs, own)[..., n:]

@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from random_models import for_refinement
+from scipy.linalg import expm
 
+from kros import from_arrays
 from kros.core import IdentificationError
-from kros.data import EpisodeKey
-from kros.identify import Factor, KoopmanMatrices, free_run
+from kros.data import Channel, EpisodeBatch, EpisodeKey, Population, Role
+from kros.identify import Factor, KoopmanMatrices, edmd, free_run, identify, unit_factors
 from kros.identify.refine import RefineOptions, refine_population
 from kros.identify.refine.metric import ResponsePrior, peak_residual
 from kros.identify.refine.problem import stability_barrier
@@ -105,3 +107,50 @@ def test_diverging_free_runs_name_unit_and_episode() -> None:
         refine_population(
             population, keys, KOOPMAN, parameters, tight, options=RefineOptions(horizons=(5, 20), segments=4, bound=1.0)
         )
+
+
+def masses_on_springs(stiffness: dict[str, float], period_s: float = 0.05, noise: float = 0.02) -> Population:
+    """Recordings of masses of 1 kg on springs, N/m, with little damping."""
+    rng, data = np.random.default_rng(0), {}
+    for unit, k in stiffness.items():
+        continuous = np.array([[0.0, 1.0, 0.0], [-k, -0.1, 1.0], [0.0, 0.0, 0.0]])
+        step = expm(continuous * period_s)[:2]
+        for episode in range(3):
+            u, x = np.repeat(rng.normal(size=50), 10), np.zeros((500, 2))
+            for i in range(499):
+                x[i + 1] = step @ [*x[i], u[i]]
+            noisy = x + noise * rng.normal(size=x.shape)
+            data[EpisodeKey(unit, "default", str(episode))] = np.column_stack([noisy, u])
+    channels = Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("force", Role.INPUT)
+    return from_arrays(data, channels, period_s)
+
+
+def test_a_unit_with_half_the_stiffness_keeps_its_resonance_and_others_theirs() -> None:
+    """The resonance is ``sqrt(k / m)``; a prior that makes units alike would move all of them to one."""
+    stiffness = {"a": 1.0, "b": 1.04, "soft": 0.5, "d": 0.97, "e": 1.01}
+    models = identify(masses_on_springs(stiffness)).models("linear")
+    poles = np.log(np.linalg.eigvals(models.A).astype(complex)) / models.sample_period_s
+    true = np.sqrt([stiffness[unit] for unit in models.unit_ids])
+    np.testing.assert_allclose(np.abs(poles).max(axis=1), true, rtol=0.01)
+
+
+def test_no_unit_is_worse_than_its_start_and_their_order_does_not_matter() -> None:
+    """Four units fill the population's model, one differs; the prior is fixed and strong."""
+    population = masses_on_springs({"a": 1.0, "b": 1.01, "c": 0.99, "d": 1.0, "soft": 0.5})
+    options = RefineOptions(strengths=(1e3,))
+    order, models = population.unit_ids, {}
+    for units in (order, order[::-1]):
+        keys = {unit: population.keys(unit) for unit in units}
+        factor = unit_factors(population, keys, LINEAR)
+        starts = edmd(factor.R, 2)
+        refined = refine_population(population, keys, LINEAR, {}, factor, options=options, starts=starts)
+        models[units] = dict(zip(units, refined.A, strict=True))
+        for row, unit in enumerate(units):
+            batch = EpisodeBatch.read(population, keys[unit])
+            x, u = (np.ascontiguousarray(np.swapaxes(signal, 0, 1)) for signal in (batch.states, batch.inputs))
+            errors = [
+                np.mean((free_run(of.A[row], of.B[row], LINEAR, {}, x[:, 0], u) - x) ** 2) for of in (refined, starts)
+            ]
+            assert errors[0] < 1.001 * errors[1]
+    first, second = models.values()
+    np.testing.assert_allclose([first[u] for u in order], [second[u] for u in order], rtol=1e-6, atol=1e-6)

@@ -21,7 +21,7 @@ from ..core.linalg import radius_text
 from ..data import Population
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
-from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
+from .edmd import AlphaSearch, KoopmanMatrices, edmd, smallest_stabilising_alpha
 from .factors import Factor, Ranges, Task, combine, lifted_factor, reduce_episodes, require_excitation
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelSet, kinds_for
@@ -236,7 +236,9 @@ class _Reduced:
         keys = {u: facts.keys("train", u, facts.identify_on) for u in self.units}
         tasks = [
             partial(
-                refine_population, base.population, keys, m.lifting, m.parameters, self.lifted(m.lifting), self.pooled
+                refine_population,
+                *(base.population, keys, m.lifting, m.parameters, self.lifted(m.lifting), self.pooled),
+                starts=KoopmanMatrices(m.A, m.B),
             )
             for m in starts
         ]

@@ -12,7 +12,7 @@ from batches import batch_of
 
 from kros.core.errors import DataError, DimensionError, SynthesisError
 from kros.core.lti import gain
-from kros.design.certificates import certify_model, guards_of
+from kros.design.certificates import certify_model, guards_of, loss_error_percent
 from kros.design.synthesize import choose_deployed
 from kros.design.task import Design
 from kros.lifting import Lifting
@@ -101,6 +101,22 @@ def test_no_pattern_of_losses_brings_an_estimate_beyond_twice_the_largest_value(
     free = corrected.run(y, np.zeros((300, 20, 1)))
     worst = [np.abs(x - batch.states).max(axis=(0, 1)) / size for x in (estimates, free)]
     assert worst[0].max() <= 3 < worst[1].max()
+
+
+@pytest.mark.parametrize("count", [5, 12, 20])
+def test_errors_with_lost_measurements_do_not_depend_on_the_order_of_units(count: int) -> None:
+    rng, model = np.random.default_rng(count), (np.array([[1.0, 0.1], [-0.2, 0.95]]), np.array([[0.0], [0.1]]))
+    inputs = rng.normal(size=(200, count, 1)) * rng.uniform(0.5, 2.0, count)[:, None]
+    states = np.zeros((200, count, 2))
+    for k in range(199):
+        states[k + 1] = 0.9 * states[k] @ model[0].T + inputs[k] @ model[1].T
+    observers = [
+        Observer("o", Lifting(("x", "v")), *model, (0,), ("u",), gain([[0.3], [0.2]], 1.0), Injection.STATE, 1.0)
+    ]
+    batch, order = batch_of(states, inputs, 1.0), rng.permutation(count)
+    errors = [loss_error_percent(observers, recorded) for recorded in (batch, batch.take(order.tolist()))]
+    assert 0 < errors[0].item() < np.inf
+    np.testing.assert_allclose(errors[0], errors[1], rtol=1e-9)
 
 
 def test_deployed_is_the_most_accurate_observer_that_is_certified_as_it_runs() -> None:

@@ -135,14 +135,18 @@ def hidden_error_percent(observers: Sequence[Observer], batches: Sequence[Episod
 
 
 def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
-    """Return the largest error in percent of the largest value where measurements are lost, shape (observer,)."""
-    rows, first = np.arange(DEFAULT.losses) % len(batch.keys), observers[0]
+    """Return the largest error in percent of the largest value where measurements are lost, shape (observer,).
+
+    Episodes have patterns of losses by how far they move, so that names and the order of units do not matter.
+    """
+    size, first = np.maximum(np.abs(batch.states).max(axis=(0, 1)), TINY), observers[0]
+    moved = (batch.states.std(axis=0, where=batch.inside[..., None]) / size).sum(axis=-1)
+    rows = np.argsort(moved)[np.linspace(0, len(moved) - 1, DEFAULT.losses).round().astype(int)]
     some = batch.take(rows.tolist()).head(int(batch.lengths[rows].min()))
     y, x = some.measurements(first.measured), some.states
     lost = losses(np.random.default_rng(0), len(y), len(rows))
     lost[len(y) // 4 :, 0] = True
     estimates = run_observers(observers, np.where(lost[..., None], np.nan, y), some.inputs, first.own(some.parameters))
-    size = np.maximum(np.abs(x).max(axis=(0, 1)), TINY)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.array([(np.abs(e[..., : x.shape[-1]] - x).max(axis=(0, 1)) / size).max() for e in estimates])
     return np.where(np.isfinite(errors), 100 * errors, np.inf)

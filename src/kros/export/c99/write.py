@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core import AnyArray, Array, Record, frozen, whole_folder, write_bytes
+from ...core import TINY, AnyArray, Array, Record, StateSpace, frozen, whole_folder, write_bytes
 from ...core.artifacts import json_bytes, with_checksum
 from ...observer import Observer, SampleStatus
 from ...observer.file import observer_content
 from .numbers import TOLERANCE, LoadOutput, Source
+
+_ROUNDINGS = 16  # of operations, in those of the coefficients
 
 
 def export_c(
@@ -88,21 +91,22 @@ def c_files(source: Source) -> dict[str, str]:
 def _golden(source: Source) -> Record:
     """Return the literals of golden vectors in the units of the recordings, and their tolerance."""
     observer, factors, tolerance = source.observer, source.factors(), TOLERANCE[source.precision.type]
-    golden = Golden.of(observer, None if source.loop is None else source.loop.name, tolerance)
+    rounded = rounded_to_single(observer) if source.precision.type == "float" else None
+    golden = Golden.of(observer, None if source.loop is None else source.loop.name, tolerance, rounded)
     signals = {
         "y": (golden.y, observer.outputs),
         "u": (golden.u, observer.inputs),
         "x": (golden.x_hat, observer.recorded),
     }
     recorded = {name: values / [factors[channel] for channel in names] for name, (values, names) in signals.items()}
-    largest = np.maximum(np.abs(recorded["x"]).max(axis=0), np.finfo(float).tiny)
+    allowed = golden.allowed / np.abs([factors[channel] for channel in observer.recorded])
     literals = {
         **{name: [[_sample(v) for v in row] for row in values] for name, values in recorded.items()},
         "status": [f"{bits}u" for bits in golden.status],
         "last": [f"{bits}u" for bits in golden.last_status],
         "sure": [[f"{bits}u" for bits in of_bits] for of_bits in golden.sure],
         "passes": golden.passes,
-        "tolerance": [f"{v:.9g}" for v in tolerance * largest],
+        "tolerance": [f"{v:.9g}" for v in allowed],
     }
     return {"golden": literals, "tolerance": tolerance}
 
@@ -159,10 +163,20 @@ class Golden:
     last_status: AnyArray  # (n_samples,)
     # (2, n_samples): bits of `status` and `last_status` that no change of signals by the tolerance turns over
     sure: AnyArray
+    allowed: Array  # (n_recorded,), differences of estimates that are rounding
 
     @classmethod
-    def of(cls, observer: Observer, track: str | None = None, tolerance: float = 0.0) -> Golden:
-        """Run an observer on smooth signals with a missing measurement, a lost input and a spike."""
+    def of(
+        cls,
+        observer: Observer,
+        track: str | None = None,
+        tolerance: float = 0.0,
+        rounded: Observer | None = None,
+    ) -> Golden:
+        """Run an observer on smooth signals with a missing measurement, a lost input and a spike.
+
+        Estimates may differ by a tolerance, and by what the same observer with rounded numbers says of rounding.
+        """
         q, m = len(observer.measured), len(observer.inputs)
         seen = observer.seen
         y_size, u_size = (np.ones(q), np.ones(m)) if seen is None else (seen.measured, seen.inputs)
@@ -176,7 +190,7 @@ class Golden:
             y[2 * count // 3] = 20 * y_size
         passes = 1 if observer.monitor is None else 2 + observer.monitor.settle // (count // 2)
 
-        def run(factor: float) -> tuple[Array, npt.NDArray[np.uint32]]:
+        def run(factor: float, observer: Observer = observer) -> tuple[Array, npt.NDArray[np.uint32]]:
             running = observer.start(factor * y[0])
             if track is not None:
                 running.track(track)
@@ -187,9 +201,22 @@ class Golden:
         x_hat, status = run(1.0)
         turned = (run(1 - tolerance)[1] ^ status) | (run(1 + tolerance)[1] ^ status)  # at a threshold but for rounding
         low, high = observer.runtime.sides(x_hat.shape[1])
-        near = tolerance * np.abs(x_hat).max(axis=0)
+        rounding = np.abs(run(1.0, rounded)[0] - x_hat).max(axis=0) if rounded is not None else 0.0
+        near = np.maximum(tolerance * np.maximum(np.abs(x_hat).max(axis=0), TINY), _ROUNDINGS * rounding)
         turned |= np.where(
             ((x_hat <= low + near) | (x_hat >= high - near)).any(axis=1), np.uint32(SampleStatus.LIMIT), 0
         )
         sure = ~np.stack([turned[:count], turned[-count:]])
-        return cls(y, u, x_hat[:count], status[:count], passes, status[-count:], sure)
+        return cls(y, u, x_hat[:count], status[:count], passes, status[-count:], sure, near)
+
+
+def rounded_to_single(observer: Observer) -> Observer:
+    """Return an observer whose numbers are those of single precision."""
+    K, bank = observer.controller, observer.bank
+
+    def single(values: Array) -> Array:
+        return values.astype(np.float32).astype(float)
+
+    K = StateSpace(single(K.A), single(K.B), single(K.C), single(K.D), K.dt)
+    bank = None if bank is None else replace(bank, start=single(bank.start))
+    return replace(observer, A=single(observer.A), B=single(observer.B), controller=K, bank=bank)

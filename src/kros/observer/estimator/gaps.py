@@ -20,8 +20,8 @@ _ROWS = 1000  # samples at a time
 
 def training(
     observer: Observer, recordings: Recordings, samples: int, patterns: int
-) -> tuple[list[str], Array, Array, Array, Parameters]:
-    """Return units, states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
+) -> tuple[Array, Array, Array, Parameters]:
+    """Return states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
     length = min(min(recordings.lengths), samples // patterns)
     count = samples // length
     batches = [recordings.read(key).head(length) for key in recordings.some(count).keys]
@@ -34,7 +34,7 @@ def training(
     states, y, inputs = (np.concatenate(parts, axis=1)[:, again] for parts in signals)
     names = batches[0].parameters
     own = observer.own({k: np.concatenate([b.parameters[k] for b in batches])[again] for k in names})
-    return [batches[i].keys[0].unit for i in again], states, y, inputs, own
+    return states, y, inputs, own
 
 
 def decay(apart: Array, judged: Sequence[int]) -> Array:
@@ -70,7 +70,7 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
     shares = np.linspace(0.1, 0.95, -(-batch // 2))
     for i in range(batch):
         if i % 2:
-            lengths = np.exp(rng.uniform(0, np.log(max(2, n_samples)), n_samples)).astype(int)
+            lengths = np.exp(rng.uniform(0, np.log(max(2, n_samples / 2)), n_samples)).astype(int)
             missing[1:, i] = np.repeat(np.arange(n_samples) % 2 == 1, lengths)[: n_samples - 1]
         else:
             missing[1:, i] = rng.random(n_samples - 1) < shares[i // 2]
@@ -82,8 +82,8 @@ def with_gaps(
 ) -> FilterBank:
     """Return a filter bank with the ages of gaps that minimise the errors of trials under simulated losses.
 
-    Units count alike, however large their errors are. Trials do not know their recordings. Measured states have no
-    age: their substitutes are near the fallback always.
+    Trials count alike, and do not know their recordings. Measured states have no age: their substitutes are near the
+    fallback always.
     """
     n, errors = len(F), list[Array]()
     hidden = [i for i in range(n) if i not in trials[0][0].measured]
@@ -96,7 +96,7 @@ def with_gaps(
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
     for trial, recordings in trials:
         samples, patterns = (-(-each // len(trials)) for each in (settings.gap_samples, settings.gap_episodes))
-        units, states, y, inputs, own = training(trial, recordings, samples, patterns)
+        states, y, inputs, own = training(trial, recordings, samples, patterns)
         lost, some = losses(rng, *y.shape[:2]), rng.random(y.shape[1:]) < 0.5
         some[np.arange(len(some)), rng.integers(y.shape[2], size=len(some))] = True  # of several sensors some are lost
         assert trial.bank is not None
@@ -105,7 +105,7 @@ def with_gaps(
         filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
         filtered[..., list(trial.measured)] = states[..., list(trial.measured)]
         squares = blended_errors(states, filtered, from_inputs, lost, F, hidden, T, mu)
-        errors += [squares[:, np.array(units) == unit].mean(axis=1) for unit in dict.fromkeys(units)]
+        errors.append(squares.mean(axis=1))
     choice = np.log(np.maximum(errors, TINY)).mean(axis=0).argmin(axis=0)
     half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
     return replace(bank, half=half, recovery=recovery)
@@ -116,7 +116,7 @@ def distances(
 ) -> tuple[Array, Array]:
     """Return by which matrix distances from estimates of inputs alone decay, and their RMS; `held` have no decay."""
     n, at = len(observer.recorded), list(observer.measured)
-    _, states, y, inputs, own = training(observer, recordings, settings.gap_samples, settings.gap_episodes)
+    states, y, inputs, own = training(observer, recordings, settings.gap_samples, settings.gap_episodes)
     from_inputs = recorded_estimates(observer, y, inputs, own)[..., n:]
     apart = states - from_inputs
     F = decay(apart, [i for i in range(n) if i not in at] or at)

@@ -285,3 +285,17 @@ def test_a_damaged_first_file_gives_no_period_and_spoils_no_other(folder: Path) 
     with pytest.raises(DataError, match=r"cold_1\.csv: CSV parse error"):
         population.read(population.episodes[0])
     assert population.read(population.episodes[1]).shape == (N, 2)
+
+
+def test_an_optional_channel_in_another_unit_is_converted_and_not_absent(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("x [m],v [mm/s],u\n" + "".join(f"{k},{1000 * k},0\n" for k in range(5)))
+    channels = [
+        {"name": "x", "column": "x [m]", "role": "state", "measured": True},
+        {"name": "v", "column": "v [m/s]", "role": "state"},
+        {"name": "w", "column": "w [m/s]", "role": "state"},
+        {"name": "u", "role": "input"},
+    ]
+    described = {"files": r"(?P<unit>\w)\.csv", "sample_period_s": 0.1, "channel": channels}
+    found = read_csv_folder(tmp_path, described, optional=["v", "w"])
+    assert found.states == ("x", "v")
+    np.testing.assert_allclose(found.read(found.keys()[0])[:, 1], range(5))

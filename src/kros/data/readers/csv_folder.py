@@ -293,8 +293,8 @@ def _episodes(
 def _absent(mapping: CsvMapping, fields: Names, optional: Collection[str]) -> set[str]:
     """Return the channels that are not there and need not be: those that are optional, and truths."""
     spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
-    known = {*fields, *range(1, len(fields) + 1)}
-    absent = {c.name for c in spared for unit in mapping.units if mapping.column(c, unit) not in known}
+    units = mapping.units
+    absent = {c.name for c in spared for u in units if not _named(fields, mapping.column(c, u), c.column_unit)}
     return absent | {c.name for c in mapping.channel if c.truth_of in absent}
 
 
@@ -358,13 +358,19 @@ def _conversion(table: Table, at: int, column: Column, declared: str, known: dic
     return theirs.factor / ours.factor, (theirs.offset - ours.offset) / ours.factor
 
 
-def _position(table: Table, column: Column, unit: str = "") -> int:
-    """Return the position of a column by number or name; a declared unit may differ from that in the header."""
-    fields = list(table.fields)
+def _named(fields: Names, column: Column, unit: str) -> list[int]:
+    """Return the positions of a column by number or name; a declared unit may differ from that in the header."""
     places = [i for i, field in enumerate(fields) if column in (field, i + 1)]
     name, written = split_header(str(column))
     if not places and (unit or written):
         places = [i for i, field in enumerate(fields) if split_header(field)[0] == name]
+    return places
+
+
+def _position(table: Table, column: Column, unit: str = "") -> int:
+    """Return the position of a column, see `_named`."""
+    fields = list(table.fields)
+    places = _named(table.fields, column, unit)
     if len(places) == 1:
         return places[0]
     problem = f"column {column!r} is missing{did_you_mean(column, fields) or ','} found {fields}"

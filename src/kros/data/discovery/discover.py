@@ -224,11 +224,10 @@ def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn
 
 
 def _doubted(columns: Sequence[TableColumn], time_scale: float, notes: Mapping[str, str]) -> list[str]:
-    """Return sentences about a guessed unit of time other than seconds, and about columns that are not recognised."""
+    """Return sentences about a guessed unit of time other than seconds, and about columns that are left out."""
     guess = [f"time_scale = {time_scale:g}: {notes['time_scale']}"] if time_scale != 1 else []
-    for part, what in ((ColumnPart.LEFT_OUT, "left out"), (ColumnPart.STATE, "taken for states to estimate")):
-        if unknown := [c for c in columns if c.part is part and c.why == UNKNOWN]:
-            guess.append(f"columns that move, not recognised, {what}: {_names(unknown)}; name an --input or --measured")
+    if unknown := [c for c in columns if c.part is ColumnPart.LEFT_OUT and c.why == UNKNOWN]:
+        guess.append(f"columns that move, not recognised, left out: {_names(unknown)}; name an --input or --measured")
     return guess
 
 

@@ -166,7 +166,8 @@ def _no_worse_than_starts(data: TrainingData, problem: RefinementProblem, V: Arr
         log.warning("Refined apart from the other units, near which free runs are worse than by EDMD: %s", units)
         V[worse] = _fit(weakest.of_units(worse), V[worse], iterations)
         rows = worse[cost_at_start[worse] < free.of_units(worse).evaluate(V[worse])[:, -1, -1]]
-        V[rows] = _fit(free.of_units(rows), starts[rows], iterations) if rows.size else V[rows]
+        if rows.size:
+            V[rows] = _fit(free.of_units(rows), starts[rows], iterations)
     return V
 
 

@@ -7,8 +7,8 @@ The parameters x of all entries (`sections`) are moved together, to minimise
 
 The second term is what soundness at all frequencies costs in scale. Square weights pay a share of their peak: a large
 one brings an inverse form close to an ill-posed set. The start x_0 are the best fits of the optimal cover, entry by
-entry (`magnitude`). Whole families of weights are within a fraction of a decibel of the
-optimum; the last term makes it unique, so that it follows the residuals continuously, and not their rounding.
+entry (`magnitude`). Whole families of weights are within a fraction of a decibel of the optimum; the last term makes it
+unique, so that it follows the residuals continuously, and not their rounding.
 
 Every maximum is smoothed, `T log sum exp(. / T)`, with a falling temperature T; steps are those of Gauss and Newton,
 damped, with the spread of the gradients, `(sum w g g^T - (sum w g)(sum w g)^T) / T`. Singular values move along their

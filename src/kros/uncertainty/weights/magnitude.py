@@ -243,7 +243,7 @@ class _Grid:
         return best
 
     def _solved(self, scale: AnyArray, gamma: float) -> tuple[AnyArray, AnyArray] | None:
-        """Return a and b, up to a factor, of the program's solution."""
+        """Return a and b, up to a factor, of the program's solution; None where it has none."""
         from scipy.optimize import nnls
 
         d = self.phi / scale[:, None]
@@ -254,10 +254,15 @@ class _Grid:
         try:
             R = qr_triangle(np.vstack([high, MAGNITUDE.below * low]))
             rows = np.vstack([np.linalg.solve(R.T, np.vstack([high, low, ends]).T), limits])
-            solution = rows[:-1] @ nnls(rows, np.eye(len(rows))[-1])[0]
-            a, b = np.split(np.linalg.solve(R, solution), 2)
-        except (np.linalg.LinAlgError, ValueError, RuntimeError):  # a basis function that is zero on the grid
+        except np.linalg.LinAlgError:  # a basis function that is zero on the grid
             return None
+        if not np.isfinite(rows).all():
+            return None
+        try:
+            solution = rows[:-1] @ nnls(rows, np.eye(len(rows))[-1])[0]
+        except RuntimeError:  # not solved in as many steps as nnls takes: no better bound from this denominator
+            return None
+        a, b = np.split(np.linalg.solve(R, solution), 2)
         return a, b
 
 

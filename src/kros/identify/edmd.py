@@ -44,6 +44,7 @@ class AlphaSearch:
     bisections: int = 30  # between the last two values, which leave 1e-10 of the coefficient
     factor: float = 4.0  # how far alpha is above the smallest coefficient that stabilises every model, at least
     doublings: int = 12  # of the factor, at most, until the models of the units are alike
+    largest_residual: float = 0.5  # peak up to which they are alike
     points: int = 60  # frequencies at which the models of the units are compared
 
 

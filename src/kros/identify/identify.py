@@ -21,12 +21,12 @@ from ..core.linalg import radius_text
 from ..data import Population
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
-from .edmd import AlphaSearch, KoopmanMatrices, edmd, smallest_stabilising_alpha
+from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
 from .factors import Factor, Ranges, Task, combine, lifted_factor, reduce_episodes, require_excitation
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
-from .refine import RefineOptions, refine_population
+from .refine import refine_population
 from .refine.metric import peak_residual
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
 from .survey import RecordingFacts, check_usable, survey
@@ -217,11 +217,11 @@ class _Reduced:
         pairs = zip(sets, factors, strict=True)
         shared = [(m.ranges.triangles(factor.R[self.rows]), m.lifting.n_lifted) for m, factor in pairs]
         edge = smallest_stabilising_alpha(shared)
-        search, limit = AlphaSearch(), RefineOptions().largest_residual
+        search = AlphaSearch()
         times = search.factor
         for factor in times * 2.0 ** np.arange(search.doublings if self.feeds_synthesis and edge > 0 else 0):
             models = [edmd(R, n, factor * edge) for R, n in shared]
-            if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):  # they are alike
+            if not any(peak_residual(m.A, m.B, search.points) > search.largest_residual for m in models):
                 times = float(factor)
                 break
         note = (
@@ -236,9 +236,7 @@ class _Reduced:
         keys = {u: facts.keys("train", u, facts.identify_on) for u in self.units}
         tasks = [
             partial(
-                refine_population,
-                *(base.population, keys, m.lifting, m.parameters, self.lifted(m.lifting), self.pooled),
-                starts=KoopmanMatrices(m.A, m.B),
+                refine_population, base.population, keys, m.lifting, m.parameters, self.lifted(m.lifting), self.pooled
             )
             for m in starts
         ]

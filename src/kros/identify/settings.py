@@ -48,8 +48,8 @@ class IdentifySettings(Settings):
     At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the
     population is finite; the factor is doubled until the peak residual around the best nominal unit is at most one
     half, where that can be reached. `refine` replaces these models by ones that are refined on their free-run error,
-    the population first, then each unit, held near the population's model by a prior. The prior is never so weak that
-    the peak residual exceeds one half, unless EDMD models are better; a unit that it makes worse than EDMD is free.
+    the population first, then each unit, held near the population's model by a prior. Its strength is chosen on
+    episodes that the fit leaves out.
     """
 
     alpha: Annotated[float, Field(ge=0)] | Literal["auto"] = Field(

@@ -4,9 +4,7 @@
 
 Models that predict alike may differ wildly in weakly excited directions, and what differs is uncertainty. The prior
 therefore measures the distance from the pooled model as the uncertainty does (`metric`), and the strength is chosen on
-held-out training episodes: the strongest one whose error is as good as the best. Models too unlike for a robust
-observer are considered only where EDMD is better than all others, and only up to its error. A unit that the prior makes
-worse than EDMD has the weakest one, or none and EDMD for a start: no fit costs more than EDMD.
+held-out training episodes: the strongest one whose error is as good as the best, however unlike the models are then.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor, Ranges
 from ..free_run import free_run
-from .metric import ResponsePrior, peak_residual
+from .metric import ResponsePrior
 from .problem import OneStep, RefinementProblem, stability_barrier
 from .search import RefineOptions
 from .segments import Segments, TrainingData, held_segments, read_segments
@@ -40,7 +38,6 @@ def refine_population(
     factor: Factor,
     pooled: Flags | None = None,
     options: RefineOptions | None = None,
-    starts: KoopmanMatrices | None = None,
 ) -> KoopmanMatrices:
     """Refine the models of a population on free-run error.
 
@@ -56,8 +53,6 @@ def refine_population(
     pooled : ndarray of bool, shape (unit,), optional
         Units that make the pooled model and choose the strength; all by default. The others get the same prior.
     options : RefineOptions, optional
-    starts : KoopmanMatrices, optional
-        EDMD models of the units; without them every unit has the prior.
 
     Returns
     -------
@@ -87,11 +82,10 @@ def refine_population(
     values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters if name in parameters}
     data = TrainingData(population, keys, lifting, values, factor, marks)
     ranges = Ranges.of(factor, lifting.n_lifted, marks)
-    starts = None if starts is None else ranges.normalise(starts)
-    return ranges.restore(_refine(data.divided_by(ranges), options or RefineOptions(), starts))
+    return ranges.restore(_refine(data.divided_by(ranges), options or RefineOptions()))
 
 
-def _refine(data: TrainingData, options: RefineOptions, starts: KoopmanMatrices | None) -> KoopmanMatrices:
+def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     """Refine in channels divided by their ranges."""
     count, longest = options.segments, max(options.horizons)
     segments = read_segments(data.population, data.keys, longest, count, options.seed, data.lifting.history)
@@ -102,15 +96,12 @@ def _refine(data: TrainingData, options: RefineOptions, starts: KoopmanMatrices 
     pooled = problem.matrices(common)
     prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
     problem = replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
-    V = None if starts is None else problem.whitened(starts)
-    limit = np.inf if V is None else (1 + options.tolerance) * _score(data, problem, V)[0]
-    path, scores, peaks = _path(data, problem, common, limit)
-    choice = _choose(scores, peaks, limit, options)
+    path, scores = _path(data, problem, common)
+    choice = _choose(scores, options)
     strength = options.strengths[choice]
     log.info("prior of strength %g chosen, held-out score %.4g", strength, scores[choice])
     final = replace(problem, segments=segments).with_prior(strength)
-    refined = _fit(final, path[choice], options.final_iterations)
-    models = final.matrices(refined if V is None else _no_worse_than_starts(data, final, refined, V))
+    models = final.matrices(_fit(final, path[choice], options.final_iterations))
     for unit, radius in zip(data.keys, models.spectral_radius(), strict=True):
         if not radius < 1 - options.margin:
             raise IdentificationError(
@@ -121,32 +112,25 @@ def _refine(data: TrainingData, options: RefineOptions, starts: KoopmanMatrices 
     return models
 
 
-def _path(
-    data: TrainingData, problem: RefinementProblem, common: Array, limit: float
-) -> tuple[list[Array], Array, Array]:
-    """Fit all units at falling strengths, until weaker ones bring nothing; return parameters, scores and peaks."""
-    options = problem.options
+def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], Array]:
+    """Fit all units at falling strengths, until weaker ones bring nothing; return parameters and held-out errors."""
+    options, path, scores = problem.options, list[Array](), list[float]()
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
-    path: list[Array] = []
-    rows: list[tuple[float, float]] = []
     for strength in options.strengths:
         V = _fit(problem.with_prior(strength), V, options.path_iterations)
         path.append(V)
-        score, peak = _score(data, problem, V)
-        rows.append((score, peak))
-        earlier = rows[-1 - options.patience][0] if len(rows) > options.patience else np.inf
-        if score > (1 - options.tolerance / 2) * earlier or (peak > options.largest_residual and score <= limit):
+        scores.append(_score(data, problem, V))
+        earlier = scores[-1 - options.patience] if len(scores) > options.patience else np.inf
+        if scores[-1] > (1 - options.tolerance / 2) * earlier:
             break
-    scores, peaks = np.array(rows).T
-    return path, scores, peaks
+    return path, np.array(scores)
 
 
-def _score(data: TrainingData, problem: RefinementProblem, V: Array) -> tuple[float, float]:
-    """Return the held-out error of pooled units, and the peak residual of their models."""
+def _score(data: TrainingData, problem: RefinementProblem, V: Array) -> float:
+    """Return the held-out error of pooled units."""
     pooled, last = data.rows.tolist(), [episodes[-1] for episodes in data.keys.values()]
-    models = problem.matrices(V[pooled])
-    rms, _ = free_run_errors(data, models, pooled, [last[row] for row in pooled])
-    return float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)
+    rms, _ = free_run_errors(data, problem.matrices(V[pooled]), pooled, [last[row] for row in pooled])
+    return float(np.mean((rms / problem.sigma) ** 2))
 
 
 def _fit(problem: RefinementProblem, V: Array, iterations: int) -> Array:
@@ -155,38 +139,15 @@ def _fit(problem: RefinementProblem, V: Array, iterations: int) -> Array:
     return search.minimise(problem.evaluate, problem.admissible, V, lambda rows: problem.of_units(rows).evaluate).V
 
 
-def _no_worse_than_starts(data: TrainingData, problem: RefinementProblem, V: Array, starts: Array) -> Array:
-    """Return V, units whose stable start costs less refitted: with the weakest prior, else from there without one."""
-    iterations, free = problem.options.final_iterations, replace(problem, prior=None)
-    weakest = problem.with_prior(min(problem.options.strengths))
-    cost_at_start = np.where(problem.admissible(starts), free.evaluate(starts)[:, -1, -1], np.inf)
-    worse = np.flatnonzero(cost_at_start < free.evaluate(V)[:, -1, -1])
-    if worse.size:
-        units = ", ".join(list(data.keys)[row] for row in worse)
-        log.warning("Refined apart from the other units, near which free runs are worse than by EDMD: %s", units)
-        V[worse] = _fit(weakest.of_units(worse), V[worse], iterations)
-        rows = worse[cost_at_start[worse] < free.of_units(worse).evaluate(V[worse])[:, -1, -1]]
-        if rows.size:
-            V[rows] = _fit(free.of_units(rows), starts[rows], iterations)
-    return V
-
-
-def _choose(scores: Array, peaks: Array, limit: float, options: RefineOptions) -> int:
-    """Return the strongest prior about as good as the best, or a weaker and better one that costs nothing.
-
-    Uncertainty costs nothing while the peak residual is negligible. It may be too large only where scores below are
-    beyond the limit.
-    """
-    usable = scores[peaks <= options.largest_residual]
-    best = float(np.min(usable if usable.size and usable.min() <= limit else scores))
+def _choose(scores: Array, options: RefineOptions) -> int:
+    """Return the strongest prior about as good as the best."""
+    best = float(np.min(scores))
     if not np.isfinite(best):
         raise IdentificationError(
             "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add "
             f"strengths above {max(options.strengths):g}."
         )
-    choice = int(np.argmax(scores <= (1 + options.tolerance) * best))
-    free = [i for i in range(choice, len(scores)) if peaks[i] <= options.negligible_residual]
-    return min(free, key=lambda i: scores[i], default=choice)
+    return int(np.argmax(scores <= (1 + options.tolerance) * best))
 
 
 def start_pooled(data: TrainingData, segments: Segments, options: RefineOptions) -> tuple[Array, RefinementProblem]:
@@ -199,7 +160,7 @@ def start_pooled(data: TrainingData, segments: Segments, options: RefineOptions)
     T = _whitening(R[:p, :p], int(data.factor.n_samples[rows].sum()))
     one_step = OneStep.of(data.factor, T, n, rows)
     problem = RefinementProblem(lifting, data.parameters, segments, T, np.ones(n), one_step, options)
-    V = problem.whitened(matrices)[None]
+    V = np.linalg.solve(T, np.concatenate([matrices.A, matrices.B], axis=-1).T).T[None]
     normal = problem.of_one_model(rows).run(V)
     with np.errstate(invalid="ignore"):
         error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())

@@ -132,11 +132,6 @@ class RefinementProblem:
         W, n_lifted = V @ self.T.T, self.lifting.n_lifted
         return KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:])
 
-    def whitened(self, models: KoopmanMatrices) -> Array:
-        """Return whitened parameters of models."""
-        W = np.concatenate([models.A, models.B], axis=-1)
-        return np.swapaxes(np.linalg.solve(self.T, np.swapaxes(W, -1, -2)), -1, -2)
-
     def finite(self, V: Array) -> Flags:
         """Return which models hold numbers only."""
         return np.all(np.isfinite(V), axis=(-1, -2))

@@ -138,8 +138,6 @@ class RefineOptions:
     strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)  # strongest first
     patience: int = 3  # strengths over which the held-out error must fall by half of the tolerance
     tolerance: float = 0.1  # the strongest prior whose held-out error exceeds the lowest by at most this is chosen
-    largest_residual: float = 0.5  # peak above which a set of models is too large for a robust observer
-    negligible_residual: float = 0.1  # peak up to which accuracy alone decides
 
     # Search
     search: GaussNewton = field(default_factory=GaussNewton)  # at each horizon

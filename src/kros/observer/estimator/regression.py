@@ -104,11 +104,12 @@ class Moments:
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 16 * len(gram) * EPS
         for penalty, start, restart in candidates:
-            errors = start * whitening.elsewhere + restart * whitening.disturbed
-            A = gram + errors + np.diag(penalty * whitening.penalty)
+            A = gram + start * whitening.elsewhere + restart * whitening.disturbed
+            A.flat[:: len(A) + 1] += penalty * whitening.penalty
             q = 1 / np.sqrt(np.diag(A))
-            scaled = A * q[:, None] * q + rounding * np.eye(len(q))
-            yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
+            A *= q[:, None] * q
+            A.flat[:: len(A) + 1] += rounding
+            yield q[:, None] * cho_solve(cho_factor(A, overwrite_a=True, check_finite=False), q[:, None] * cross)
 
     def best(self, errors: Array, among: Flags | None = None) -> Whole:
         """Return the best candidates of every state for each pair of weights, which come in turn, shape (2, n).

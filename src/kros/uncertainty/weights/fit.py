@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import AnyArray, Flags, StateSpace, block_diagonal, frozen, gain
+from ...core import AnyArray, DataError, Flags, StateSpace, block_diagonal, frozen, gain
 from ...core.frequency import nyquist_hz
 from ...core.linalg import pieces
 from ..forms import Form, completion, evenly, residual
@@ -33,8 +33,11 @@ def fit_weight(
     """
     fit = _Fit(residuals, freqs_hz, sample_period_s)
     cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
-    p, m = fit.known.shape[2:]
-    if not fit.known.any():
+    p, m = cover.left.shape[1], cover.right.shape[1]
+    if not fit.tight_hz.size:
+        if any(E.any() for _, E in residuals.pieces(fit.checked_hz)):
+            alike = f"units are alike at all {len(freqs_hz)} frequencies given, and differ elsewhere"
+            raise DataError(f"Weights: {alike}; give frequencies at which they differ.")
         nothing = gain(np.zeros((p, p)), sample_period_s), gain(np.eye(m), sample_period_s)
         return Weight(*nothing, (0,) * p, (0,) * m, 0.0, 0.0), cover
     at, fitted = fit.start_hz(), None
@@ -81,10 +84,9 @@ class _Fit:
         modes = residuals.modes_hz(grid, dt)
         self.checked_hz = np.union1d(grid, modes)
         self.freqs_hz = np.union1d(freqs_hz, modes[self._inside(modes)])
-        self.known = residuals.at(self.freqs_hz)
         few = residuals.count * len(self.checked_hz) <= SET.retained
         self.checked = residuals.at(self.checked_hz) if few else None
-        self.optimal = optimal_cover(self.known)
+        self.optimal = optimal_cover(residuals.at(self.freqs_hz))
         some = self.optimal.left.min(axis=1) > 0
         self.tight_hz, self.tight = self.freqs_hz[some], self.optimal.at(some)
 
@@ -110,7 +112,7 @@ class _Fit:
 
     def weight(self, sections: Sections) -> Weight:
         """Return the systems of magnitudes, left ones first."""
-        systems, orders, p = sections.systems(self.dt), tuple(sections.orders.tolist()), self.known.shape[2]
+        systems, orders, p = sections.systems(self.dt), tuple(sections.orders.tolist()), self.tight.left.shape[1]
         return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:])
 
     def costly(self, weight: Weight, excess_db: float) -> AnyArray:

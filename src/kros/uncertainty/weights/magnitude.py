@@ -163,13 +163,13 @@ def _better(tau: AnyArray, targets: AnyArray, order: int, known: Bound) -> Bound
     """Return the bound by the best n / d of one order, positive on the whole axis, or the known one if that is none."""
     knots, cuts = np.exp(_bends(tau, np.log(targets), order)), np.zeros(0)
     for _ in range(MAGNITUDE.rounds):
-        best = _dinkelbach(tau, targets, knots, cuts, 10 ** (known.excess_db / 10))
+        best, ratio = _dinkelbach(tau, targets, knots, cuts, 10 ** (known.excess_db / 10))
         if best is None:
             break
         try:
             zeros = best.not_positive()
             if not zeros.size:
-                return Bound(best.factor(), 10 * float(np.log10((best(tau) / targets).max())))
+                return Bound(best.factor(), 10 * float(np.log10(ratio)))
         except KrosError:  # roots at zero, at infinity or too near the unit circle
             break
         cuts = np.unique(np.concatenate([cuts, zeros, np.sqrt(zeros[1:] * zeros[:-1])]))
@@ -188,8 +188,8 @@ def _bends(tau: AnyArray, log: AnyArray, count: int) -> AnyArray:
 
 def _dinkelbach(
     tau: AnyArray, targets: AnyArray, knots: AnyArray, cuts: AnyArray, gamma: float
-) -> RationalMagnitude | None:
-    """Return the bound of the smallest ratio with n and d that do not fall at DC, Nyquist and cuts; none above gamma."""
+) -> tuple[RationalMagnitude | None, float]:
+    """Return the bound of the smallest ratio below gamma, and that; n and d do not fall at DC, Nyquist and cuts."""
     phi, edges = basis(tau, knots), np.concatenate([[0.0], cuts, [np.inf]])
     edge = basis(edges, knots) - MAGNITUDE.edge * phi[np.searchsorted(tau, edges).clip(max=len(tau) - 1)]
     best, scale = None, targets**-0.5  # n and d share the slope
@@ -197,14 +197,14 @@ def _dinkelbach(
         try:
             a, b = _program(phi / scale[:, None], targets, edge, gamma)
         except (RuntimeError, np.linalg.LinAlgError):  # no solution in as many steps as nnls takes, or no unique one
-            return best
+            return best, gamma
         n, d = phi @ a, phi @ b
         if not ((d > 0) & (n > 0)).all():
-            return best
+            return best, gamma
         ratio = n / (targets * d)
         spread = float(ratio.max() / ratio.min())
         if spread >= gamma * MAGNITUDE.settled:
-            return best
+            return best, gamma
         best, gamma, scale = RationalMagnitude(a / ratio.min(), b, knots), spread, d
 
 
@@ -233,11 +233,6 @@ class RationalMagnitude:
     numerator: AnyArray  # (order + 1,): coefficients a
     denominator: AnyArray  # (order + 1,): coefficients b
     knots: AnyArray  # (order,): the tau_k
-
-    def __call__(self, tau: ArrayLike) -> AnyArray:
-        """Return the squared magnitude, shape of `tau`; infinity (Nyquist) is allowed."""
-        phi = basis(np.asarray(tau, float), self.knots)
-        return (phi @ self.numerator) / (phi @ self.denominator)
 
     @cached_property
     def sides(self) -> tuple[AnyArray, AnyArray]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import LIMITS, MACHINES, apart, drive, in_python, samples, watched
+from machines import LIMITS, MACHINES, apart, drive, filters, in_python, samples, watched
 
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, LoadOutput, export_c
@@ -15,7 +15,7 @@ from kros.export.c99.write import Golden
 from kros.lifting import Lifting
 from kros.loops.compiler import find_compiler
 from kros.motor_drive import AngleLoad
-from kros.observer import Observer, Runtime, SampleStatus
+from kros.observer import Observer, Runtime, SampleStatus, run_observer
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Wshadow", "-Werror", "-pedantic")
 TRAPPED = ("-fsanitize=undefined", "-fsanitize-undefined-trap-on-error", "-Wno-unused-function", "-O0")
@@ -60,6 +60,23 @@ def test_the_selftest_leaves_out_bits_at_a_threshold(factor, tmp_path):
     assert not masked.sure[1, -1] & 8
     assert masked.sure[1, -1] & 4
     assert CompiledObserver.build(export_c(exact, tmp_path / "c", "drive")).selftest() == 0
+
+
+@needs_compiler
+def test_a_filter_bank_of_two_sensors_of_which_one_or_both_are_lost(tmp_path):
+    observer, rng, (y, u) = filters(measured=(0, 2)), np.random.default_rng(3), samples(800)
+    y = np.column_stack([y, 0.3 * np.cos(0.02 * np.arange(800))])
+    y[0, 0], y[:7, 1], y[200:260, 0], y[240:300, 1], y[500:520] = np.nan, np.nan, np.nan, np.nan, np.nan
+    y[rng.random(y.shape) < 0.05] = np.nan
+    wanted, status = in_python(observer, y, u)
+    compiled = CompiledObserver.build(export_c(observer, tmp_path / "c", "drive"), flags=STRICT)
+    assert compiled.selftest() == 0
+    found, bits = compiled.run(y, u)
+    np.testing.assert_array_equal(bits, status)
+    assert apart(found, wanted) < 1e-9
+    begun = y[10:], u[10:]  # by the compiled loop, too
+    batch = run_observer(observer, *(np.repeat(each[:, None], 3, axis=1) for each in begun))
+    assert apart(batch[1:, 2], in_python(observer, *begun)[0][:-1]) < 1e-9
 
 
 @needs_compiler

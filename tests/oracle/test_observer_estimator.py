@@ -195,7 +195,9 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
 
 def test_left_out_errors_are_those_of_penalties_that_other_units_chose():
     recordings, _ = plant(units=4, episodes=2, spread=0.6)
-    made = design(recordings, settings=FEW.model_copy(update={"parts": 1, "rows": 1000, "sample": 1000}))
+    made = design(
+        recordings, settings=FEW.model_copy(update={"parts": 1, "rows": 1000, "sample": 1000, "gap_share": 1e-3})
+    )
     (readout,), (moments,) = Readout.of([made]), Moments.of([made], [Whitening.of(made, made.sample())])
     settings, weights = made.settings, condition_weights(moments)
     candidates = [(penalty, 0.0, settings.settled_share) for penalty in settings.penalties]
@@ -246,7 +248,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
 def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
     observer = exact[0].observer
     assert observer.bank is not None
-    bank = replace(observer.bank, half=np.full(3, 1e12), reach=np.zeros(3))
+    bank = replace(observer.bank, half=np.full((1, 3), 1e12), reach=np.zeros(3))
     A, B, n = observer.A.copy(), observer.B.copy(), observer.lifting.n_states
     A[n - 6 : n], B[n - 6 : n] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses it linearly
     A[n - 3 : n, n - 3 : n] = np.eye(3)
@@ -435,18 +437,23 @@ def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well()
     assert errors[1] < 0.4 * errors[0]
 
 
-def test_a_readout_of_its_own_counts_after_a_loss_until_the_slowest_filter_has_forgotten(motors):
+@pytest.mark.parametrize("gap", [1, 20])
+def test_a_readout_of_its_own_counts_after_a_loss_as_long_as_the_gap_until_the_slowest_filter_has_forgotten(
+    motors, gap
+):
     observer, batch = motors
     y, n = batch.states[..., :1].copy(), observer.lifting.n_states
-    y[300] = np.nan
-    runs = []
+    y[300 : 300 + gap] = np.nan
+    runs, last = [], 299 + gap
     for factor in (0.0, 1.0):
         A, B = observer.A.copy(), observer.B.copy()
         share = np.array([1.0, factor, factor])[:, None]  # substitutes are the same: the position
         A[n - 9 : n - 6], B[n - 9 : n - 6] = share * A[:3], share * B[:3]
-        one = replace(observer, A=A, B=B, bank=replace(observer.bank, half=np.full(3, 1e12)))
-        runs.append(run_observer(one, y, batch.inputs)[303:, :, 1])
-    age = 0.1 * np.exp(5) * observer.bank.start_recovery ** np.arange(2, len(y) - 301)[:, None]
+        one = replace(observer, A=A, B=B, bank=replace(observer.bank, half=np.full((1, 3), 1e12)))
+        runs.append(run_observer(one, y, batch.inputs)[last + 3 :, :, 1])
+    decay, oldest = observer.bank.start_recovery, 0.1 * np.exp(5)
+    lost = max(min(gap, oldest), oldest * float(decay[0]) ** last)
+    age = lost * decay ** np.arange(2, len(y) - last - 1)[:, None]
     np.testing.assert_allclose(runs[0], runs[1] / (1 + age**2), atol=1e-9 * np.abs(runs[1]).max())
 
 
@@ -542,9 +549,16 @@ def test_gaps_are_bridged_by_straight_lines_through_functions_too():
     np.testing.assert_allclose(apart[0] / apart[1], 4.0, rtol=0.1)
 
 
-def test_a_filter_bank_starts_at_the_first_sample_with_all_measurements(two_sensors):
+@pytest.mark.parametrize("late", [[0], [1], [0, 1]])
+def test_filters_start_at_the_first_sample_with_all_measurements_and_those_of_inputs_go_on(two_sensors, late):
     observer, batch = two_sensors
-    y, u = batch.states[..., [0, 2]].copy(), batch.inputs
-    wanted = run_observer(observer, y[3:], u[3:])
-    y[:3, :, 1] = np.nan
-    np.testing.assert_allclose(run_observer(observer, y, u)[4:], wanted[1:], atol=1e-8 * np.abs(wanted).max())
+    y, u, n = batch.states[..., [0, 2]].copy(), batch.inputs, len(observer.recorded)
+    wanted, whole = (Course(observer, y.shape[1]).take(y[k:], u[k:]).estimates for k in (30, 0))
+    y[:30, :, late] = np.nan
+    found = Course(observer, y.shape[1]).take(y, u).estimates
+    filters, inputs = slice(n, n + observer.bank.filters), slice(n + observer.bank.filters, -3 * n)
+    for part, other in ((filters, wanted[1:]), (inputs, whole[31:])):
+        scale = np.abs(other[..., part]).max()
+        np.testing.assert_allclose(found[31:, :, part], other[..., part], atol=1e-8 * scale)
+    velocity, from_inputs, offset = (found[1:31, :, k] for k in (1, 1 - 2 * n, 1 - n))
+    np.testing.assert_allclose(velocity, from_inputs + offset, atol=1e-9 * np.abs(velocity).max())

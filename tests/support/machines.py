@@ -62,8 +62,8 @@ MACHINES = {
 }
 
 
-def filters(functions=GEAR, cut=False):
-    """A filter bank with two filters, one of inputs alone, and an age of gaps for every state."""
+def filters(functions=GEAR, cut=False, measured=(0,)):
+    """A filter bank with two filters, one of inputs alone, and ages of gaps for every state."""
     parameters = ("phase",) if functions else ()
     fallback = tuple(
         f"{name}_{what}" for what in ("after_start", "from_inputs", "offset_from_inputs") for name in STATES
@@ -72,7 +72,7 @@ def filters(functions=GEAR, cut=False):
     lifting = Lifting(states, functions, parameters, ("target", "rate"), ("rate*position", "1"))
     rng, n, p = np.random.default_rng(3), lifting.n_states, lifting.n_lifted
     A, B = np.zeros((p, p)), np.zeros((p, 4))
-    seen = [0, *range(n, p)]
+    seen, others = [*measured, *range(n, p)], [i for i in range(n) if i not in measured]
     A[:5, seen], B[:5] = 0.1 * rng.normal(size=(5, len(seen))), 0.1 * rng.normal(size=(5, 4))
     A[:5, 3:5] = [[0.1, 0.0], [0.5, 0.1], [0.0, 0.7], [0.9, 0.1], [-0.1, 0.9]]
     A[0, 0] += 1.0
@@ -81,16 +81,29 @@ def filters(functions=GEAR, cut=False):
     A[9:12, 5], B[9:12, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
     A[12:15, 12:15] = [[0.99, 0.05, 0.0], [-0.05, 0.9, 0.02], [0.0, 0.1, 0.5]]
     start = 0.1 * rng.normal(size=(n, p + 4))
-    start[:, 1:n] = 0.0  # states that are not measured are not known
+    start[:, others] = 0.0  # states that are not measured are not known
     start[12:15] = 0.0
-    ages = ([5.0, 8.0, 2.0], [0.8, 0.9, 0.99], [0.05, 0.4, 0.5], [0.95])
+    kinds = len(measured)  # of gaps: of all, and of some
+    ages = ([[5.0, 8.0, 2.0], [9.0, 20.0, 7.0]], [[0.8, 0.9, 0.99], [0.9, 0.95, 0.8]])
+    ages = *(values[:kinds] for values in ages), [0.05, 0.4, 0.5], [0.95]
     bank = FilterBank(2, start, *map(np.array, ages))
-    none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((p, 0)), np.zeros((p, 1)), DT)
+    q = len(measured)
+    none = StateSpace(np.zeros((0, 0)), np.zeros((0, q)), np.zeros((p, 0)), np.zeros((p, q)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))
     first = np.append([0.4, 0.1, -0.1], np.zeros(n - 3))
     runtime = Runtime(0, low, high, first) if cut else Runtime(start=first)
-    parts = (lifting, A, B, (0,), ("target", "rate"), none, Injection.STATE, DT, {"phase": 0.3} if functions else {})
-    return Observer("filters", *parts, runtime, Seen(np.array([1.5]), np.array([2.0, 9.0])), bank=bank)
+    parts = (
+        lifting,
+        A,
+        B,
+        measured,
+        ("target", "rate"),
+        none,
+        Injection.STATE,
+        DT,
+        {"phase": 0.3} if functions else {},
+    )
+    return Observer("filters", *parts, runtime, Seen(np.full(q, 1.5), np.array([2.0, 9.0])), bank=bank)
 
 
 def watched(observer, bound=1.0):

@@ -50,6 +50,7 @@ typedef struct {
     whole own;         /* every machine has a map of its own: one observer, map (batch, rows, columns) */
     whole fresh;       /* earlier values equal the present ones at the first sample */
     whole recorded;    /* first states; the last ones are those after a start, those from inputs alone, and how far apart they are; none */
+    whole kinds;       /* of gaps: of all measurements, and of some */
     whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
     const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
     const double *y;          /* (samples, q, batch); none where nothing is measured */
@@ -62,8 +63,8 @@ typedef struct {
     double *past;             /* (observers, batch, earlier), moved on */
     const double *reach;      /* (recorded) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
-    const double *bank;       /* (4, recorded, batch): half, recovery, longest age, recovery of a start */
-    double *gap;              /* (recorded + q + 1 + q filters, batch): age, count, age of the start or the last loss, ramps; moved on */
+    const double *bank;       /* (3 kinds + 1, recorded, batch): half, recovery, longest age, recovery of a start */
+    double *gap;              /* (kinds recorded + q + 1 + q filters, batch): age, count, age of the start or the last loss, ramps; moved on */
     double *states;           /* (samples, observers, n, batch): x before every sample; none */
 } relift_job;
 
@@ -235,28 +236,41 @@ static vec clipped(vec value, vec low, vec high)
     return either(value < low, low, either(value > high, high, value));
 }
 
+#define OLDEST (0.1 * exp(5.0)) /* age of a start */
+
 static vec level(vec age, vec half)
 {
     const vec ratio = age / half;
     return ratio * ratio / (1.0 + ratio * ratio);
 }
 
+/* How much the fallback counts for a state: the most of gaps of all and of some measurements. */
+static vec counted(const relift_job *s, const vec *bank, const vec *gap, whole at)
+{
+    vec most = {0};
+    for (whole k = 0; k < s->kinds; k++) {
+        const vec share = level(gap[k * s->recorded * MOST + at], bank[k * s->recorded * MOST + at]);
+        most = either(share > most, share, most);
+    }
+    return most;
+}
+
 /* Gaps of a filter bank, see kros.observer.filter_bank for the symbols: measurements and what stands for missing ones, into states; straight lines
    over gaps that end. */
 static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg, vec *y, mask *missing, whole n, whole w)
 {
-    const whole r = s->filters, recorded = s->recorded;
+    const whole r = s->filters, recorded = s->recorded, ages = s->kinds * recorded;
     const vec *from_inputs = reg + (n - 2 * recorded) * MOST;
     vec *offset = reg + (n - recorded) * MOST;
     for (whole j = 0; j < s->q; j++)
         for (whole v = 0; v < w; v++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
-            const vec seen = y[row], count = gap[recorded * MOST + row], held = from_inputs[i] + offset[i];
+            const vec seen = y[row], count = gap[ages * MOST + row], held = from_inputs[i] + offset[i];
             const vec reach = (vec){0} + s->reach[s->measured[j]];
             const vec near = clipped(reg[i] - held, -reach, reach);
             const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
-            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(recorded + s->q + 1 + j * r + l) * MOST + v] * jump;
+            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(ages + s->q + 1 + j * r + l) * MOST + v] * jump;
             missing[row] = lost;
             reg[i] = y[row] = either(lost, held + near, seen);
         }
@@ -269,7 +283,7 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
                 lost |= missing[j * MOST + v];
                 hidden &= s->measured[j] != i;
             }
-            const vec share = either(lost, (vec){0}, 1.0 - hidden * level(gap[at], bank[at]));
+            const vec share = either(lost, (vec){0}, 1.0 - hidden * counted(s, bank, gap, at));
             const vec moved = offset[at] + share * (reg[at] - from_inputs[at] - offset[at]);
             const double most = hidden ? s->reach[i] : INFINITY;
             offset[at] = clipped(moved, (vec){0} - most, (vec){0} + most);
@@ -279,17 +293,19 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
 /* The fallback into the next estimates; ages and ramps move on. */
 static void follow(const formulas *f, const vec *reg, const relift_job *s, const vec *bank, vec *gap, vec *next, const mask *missing, vec *ramp, whole n, whole columns, whole w)
 {
-    const whole r = s->filters, q = s->q, recorded = s->recorded;
+    const whole r = s->filters, q = s->q, recorded = s->recorded, ages = s->kinds * recorded;
     for (whole v = 0; v < w; v++) {
-        mask some = {0};
-        vec longest = {0};
+        mask some = {0}, all = ~some;
+        vec longest = {0}, shortest = (vec){0} + INFINITY;
         for (whole j = 0; j < q; j++) {
             const mask lost = missing[j * MOST + v];
-            vec *count = gap + (recorded + j) * MOST + v, *of = gap + (recorded + q + 1 + j * r) * MOST + v;
+            vec *count = gap + (ages + j) * MOST + v, *of = gap + (ages + q + 1 + j * r) * MOST + v;
             const int moves = any(lost | (*count > 0.0));
             *count = either(lost, *count + 1.0, (vec){0});
             longest = either(*count > longest, *count, longest);
+            shortest = either(*count < shortest, *count, shortest);
             some |= lost;
+            all &= lost;
             for (whole i = 0; i < r && moves; i++) {
                 const double *row = s->map + (recorded + i) * columns;
                 vec slope = (vec){0} + row[s->measured[j]], sum = {0};
@@ -300,22 +316,30 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
             }
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
-        vec *start = gap + (recorded + q) * MOST + v;
-        *start = either(some, (vec){0} + 0.1 * exp(5.0), *start);
+        vec *start = gap + (ages + q) * MOST + v;
+        const vec since = clipped(longest, (vec){0}, (vec){0} + OLDEST);
+        *start = either(since > *start, since, *start);
         const vec begun = level(*start, (vec){0} + 1.0);
-        *start *= bank[3 * recorded * MOST + v];
+        *start *= bank[3 * ages * MOST + v];
+        for (whole k = 0; k < s->kinds; k++) {
+            const mask lost = k ? some : all;
+            const vec gone = k ? either(all, (vec){0}, longest) : shortest;
+            for (whole i = 0; i < recorded; i++) {
+                const whole at = (k * recorded + i) * MOST + v;
+                const vec oldest = bank[2 * ages * MOST + at], old = gap[at];
+                const vec recovered = either(lost, old, bank[ages * MOST + at] * either(old > oldest, oldest, old));
+                gap[at] = either(gone > recovered, gone, recovered);
+            }
+        }
         for (whole i = 0; i < recorded; i++) {
             const whole at = i * MOST + v;
-            const vec half = bank[at], oldest = bank[2 * recorded * MOST + at], old = gap[at];
-            const vec recovered = either(some, old, bank[recorded * MOST + at] * either(old > oldest, oldest, old));
             int hidden = 1;
             for (whole j = 0; j < q; j++) hidden &= s->measured[j] != i;
             next[at] += begun * (next[(n - 3 * recorded) * MOST + at] - next[at]);
             next[at] = clipped(next[at], (vec){0} + s->limits[i], (vec){0} + s->limits[recorded + i]);
-            gap[at] = either(longest > recovered, longest, recovered);
             const vec fallback = next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at];
             const vec reach = (vec){0} + s->reach[i], apart = next[at] - fallback;
-            if (hidden) next[at] -= level(gap[at], half) * apart;
+            if (hidden) next[at] -= counted(s, bank, gap, at) * apart;
             else next[at] = either(some, fallback + clipped(apart, -reach, reach), next[at]);
         }
     }
@@ -324,8 +348,9 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? recorded + q + 1 + q * s->filters : 0;
-    vec *bank = vectors(4 * recorded), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + q + 1 + q * s->filters : 0;
+    const whole numbers = (3 * s->kinds + 1) * recorded;
+    vec *bank = vectors(numbers), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;
     const whole groups = (rows + 3) / 4;
@@ -338,7 +363,7 @@ int kros_relift(const formulas *f, const relift_job *s)
         settle(f, reg, first, batch, lanes);
         if (s->own)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
-        for (whole i = 0; i < 4 * recorded; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
+        for (whole i = 0; i < numbers; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
         for (whole i = 0; i < gaps; i++) gather(gap + i * MOST, s->gap + i * batch + first, 1, lanes);
         for (whole o = 0; o < s->observers; o++) {
             double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;

@@ -24,7 +24,7 @@ from .runtime import Guard, Runtime, Seen
 from .sensor import Sensor
 
 log = logging.getLogger(__name__)
-SCHEMA, KIND = 4, "observer"
+SCHEMA, KIND = 5, "observer"
 _PERHAPS = ("lifting_inputs", "input_functions", "sizes", "sensor", "about")  # absent where they are empty
 Name = Annotated[str, Field(min_length=1)]
 Row = list[float]

@@ -13,20 +13,22 @@ continues the last estimate and tends to :math:`x^u`; estimates in which the fal
 since they say little. The age a of a gap is the number of samples that are missing so far; when measurements return it
 falls by a factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own :math:`\mu`:
 a state that is estimated from slow filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m
-is below one percent after five time constants of :math:`\mu`. The estimate of a state that is not measured is
+is below one percent after five time constants of :math:`\mu`. Of several measurements, gaps of all and gaps of some
+have ages, T and :math:`\mu` of their own, and the larger m counts. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
 After a start, what happened before is not known; after a loss, filters hold what stood for measurements. There
-:math:`x + m (x^s - x)` takes the place of x, with an age that falls from :math:`0.1 e^5 T` on as the slowest filter
-forgets, and T = 1. Limits of the estimates hold before the fallback enters them, so that little of what is far away
-is left in long gaps.
+:math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start and of the length of a
+gap, which falls as the slowest filter forgets. Limits of the estimates hold before the fallback enters them, so that
+little of what is far away is left in long gaps.
 
 A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of
 states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so
 are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit
 ramp was run along, through the slopes of lifted functions at what stood for the measurement, and ``z`` is corrected by
-:math:`r (y - \hat y) / (g + 1)` after g samples.
+:math:`r (y - \hat y) / (g + 1)` after g samples. At a start without all measurements, inputs alone count until the
+first sample that has them; there the filters z start again, and those of inputs, their estimate and its distance go on.
 """
 
 from __future__ import annotations
@@ -45,8 +47,8 @@ class FilterBank:
 
     filters: int
     start: Array
-    half: Array
-    recovery: Array
+    half: Array  # (1 or 2, n), T in gaps of all measurements and, of several, in gaps of some
+    recovery: Array  # (1 or 2, n)
     reach: Array
     start_recovery: Array
 
@@ -67,6 +69,9 @@ def longest_age(half: Array) -> Array:
     return 0.1 * np.exp(5) * half
 
 
+OLDEST = float(longest_age(np.ones(1))[0])  # age of a start
+
+
 class Gaps:
     """State of the gaps of filter banks over a batch of machines."""
 
@@ -80,29 +85,42 @@ class Gaps:
         )
         self._A = A[self.filters, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
+        self.of_measurements = np.arange(n) < self.filters.stop  # states that start when all of these have arrived
+        self.of_measurements[self.after_start] = True
         self._most = np.where(self.hidden, bank.reach, np.inf)
-        self.take(np.zeros((recorded + q + 1 + q * bank.filters, batch)))
+        self.take(np.zeros((bank.half.size + q + 1 + q * bank.filters, batch)))
 
     def take(self, state: Array) -> None:
         """Go on from a state whose rows are ages, counts, the age of the start and ramps of all machines."""
-        n, q = self.recorded, len(self.measured)
+        n, q = self.bank.half.size, len(self.measured)
         self.state = state
-        self.age, self.count, self.start, ramp = np.split(state.T, [n, n + q, n + q + 1], axis=1)
+        age, self.count, self.start, ramp = np.split(state.T, [n, n + q, n + q + 1], axis=1)
+        self.age = age.reshape(len(age), *self.bank.half.shape)
         self.ramp = ramp.reshape(len(ramp), q, -1).swapaxes(1, 2)
 
-    def begin(self, rows: Any) -> None:
-        """Start some machines: nothing is missing."""
+    def begin(self, rows: Any, missing: Flags) -> None:
+        """Start some machines at measurements of which some may be missing."""
         self.state[:, rows] = 0.0
-        self.start[rows] = longest_age(np.ones(1))
+        self.start[rows] = OLDEST * np.where(missing.any(axis=1, keepdims=True), 2.0, 1.0)[rows]
+
+    @property
+    def waiting(self) -> Flags:
+        """The machines of which no sample had all measurements."""
+        return self.start[:, 0] > OLDEST
+
+    @property
+    def share(self) -> Array:
+        """How much the fallback counts, (batch, n)."""
+        return np.where(self.waiting[:, None], 1.0, level(self.age, self.bank.half).max(axis=1))
 
     def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
-        share, recorded, offset = level(self.age, self.bank.half), x[:, : self.recorded], x[:, self.offset]
+        share, recorded, offset = self.share, x[:, : self.recorded], x[:, self.offset]
         if missing.any() or self.count.any():
             reach = self.bank.reach[self.measured]
             held = (x[:, self.from_inputs] + offset)[:, self.measured]
             expected = held + np.clip(x[:, self.measured] - held, -reach, reach)
-            ends = ~missing & (self.count > 0)
+            ends = ~missing & (self.count > 0) & ~self.waiting[:, None]
             if ends.any():
                 jump = np.where(ends, (np.where(missing, 0.0, y) - expected) / (self.count + 1), 0.0)
                 x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
@@ -118,15 +136,19 @@ class Gaps:
 
         Slopes are those of the next filters by the measurements, (batch, filters, q), where one is missing.
         """
-        bank, some = self.bank, np.asarray(missing.any(axis=1))
+        bank, some, none = self.bank, np.asarray(missing.any(axis=1)), np.asarray(missing.all(axis=1))
         count = np.where(missing, self.count + 1, 0.0)
-        recovered = np.where(some[:, None], self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
-        age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))
+        longest, shortest = count.max(axis=1), count.min(axis=1)
+        lost, lengths = (
+            np.stack(both, axis=1)[:, : len(bank.half), None] for both in ((none, some), (shortest, longest * ~none))
+        )
+        recovered = np.where(lost, self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
+        self.age[...] = np.maximum(recovered, lengths)
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
-        disturbed = np.where(some[:, None], longest_age(np.ones(1)), self.start)
+        disturbed = np.maximum(self.start, np.minimum(longest, OLDEST)[:, None])
         recorded += level(disturbed) * (following[:, self.after_start] - recorded)
         np.clip(recorded, *self.limits, out=recorded)
-        recorded += self.hidden * level(age, bank.half) * (fallback - recorded)
+        recorded += self.hidden * self.share * (fallback - recorded)
         at, reach = self.measured, bank.reach[self.measured]
         near = fallback[:, at] + np.clip(recorded[:, at] - fallback[:, at], -reach, reach)
         recorded[:, at] = np.where(some[:, None], near, recorded[:, at])
@@ -134,18 +156,19 @@ class Gaps:
             self.ramp[...] = 0.0
         else:
             self.ramp[...] = np.where(missing[:, None], self._A @ self.ramp + slopes * count[:, None], 0.0)
-        self.age[...], self.count[...], self.start[...] = age, count, disturbed * bank.start_recovery
+        self.count[...], self.start[...] = count, np.where(self.waiting[:, None], 1.0, bank.start_recovery) * disturbed
 
     @property
     def job(self) -> Record:
         """What the compiled loop needs of gaps."""
         bank = self.bank
-        rows = bank.half, bank.recovery, longest_age(bank.half), bank.start_recovery
+        rows = np.vstack([bank.half, bank.recovery, longest_age(bank.half), bank.start_recovery + 0.0 * bank.half[:1]])
         return {
             "recorded": self.recorded,
+            "kinds": len(bank.half),
             "filters": bank.filters,
             "reach": bank.reach,
             "limits": np.array(self.limits),
-            "bank": np.stack([np.broadcast_to(row, self.age.shape).T for row in rows]),
+            "bank": np.repeat(rows[..., None], self.state.shape[1], axis=-1),
             "gap": self.state.copy(),
         }

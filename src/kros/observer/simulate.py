@@ -149,9 +149,11 @@ class Course:
     def even(self, samples: Screened) -> bool:
         """Whether machines go on side by side: none starts again, settles, follows or looks far back."""
         steps, starts = self.steps, samples.starts[self._before is None :]
+        first = self._before is None and not np.isfinite(samples.y[0]).all()
+        begun = steps.gaps is None or not (first or steps.gaps.waiting.any())
         far = self.observer.runtime.delay and (self.observer.lifting.history or steps.gaps is not None)
         apart = starts.any() or steps.waiting.any() or self.settling.any() or np.ptp(self.since)
-        return not (far or apart or self.loop is not None)
+        return begun and not (far or apart or self.loop is not None)
 
     def enter(self, samples: Screened) -> tuple[Screened, int]:
         """Start at the first sample of all; return samples behind those that inputs are still needed of, a number."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.arrays import Array, Flags, Index, Parameters
 from .data import ObserverData
-from .filter_bank import Gaps
+from .filter_bank import OLDEST, Gaps
 from .runtime import bounds
 
 
@@ -35,7 +35,14 @@ class Steps:
         self.x[rows] = self.observer.initial(y, self.values, u)[rows]
         self.x_c[rows], self.fresh[rows], self.waiting[rows] = 0.0, True, False
         if self.gaps is not None:
-            self.gaps.begin(rows)
+            self.gaps.begin(rows, ~np.isfinite(y))
+
+    def _begin_filters(self, y: Array, u: Array, machines: Flags) -> None:
+        """Start the filters of measurements of some machines, whose filters of inputs go on."""
+        if self.gaps is not None and machines.any():
+            at = machines[:, None] & self.gaps.of_measurements
+            np.copyto(self.x, self.observer.initial(y, self.values, u), where=at)
+            self.gaps.start[machines] = OLDEST
 
     def earlier(self, u: Array) -> Array:
         """Return the earlier values, (batch, n_earlier); after a start they equal the present ones."""
@@ -53,6 +60,7 @@ class Steps:
         n, missing = self.lifting.n_states, ~np.isfinite(y)
         u = np.broadcast_to(u, (len(self.x), u.shape[-1]))
         if self.gaps is not None:
+            self._begin_filters(y, u, self.gaps.waiting & ~missing.any(axis=1))
             self.gaps.fill(self.x, y, missing)
         y = np.where(missing, self.x[:, self._measured], y)  # what is predicted corrects nothing
         delays = self.past.shape[1] > 0

@@ -12,7 +12,7 @@ from ...core import Array, ConfigError, Record, frozen
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer, recorded_channel, recorded_factors
-from ...observer.filter_bank import longest_age
+from ...observer.filter_bank import OLDEST, longest_age
 from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, Screen
@@ -125,6 +125,8 @@ class Source:
             "guard": np.clip([low, high], -self.precision.largest, self.precision.largest),
             "bounds": self.bounds(),
             "longest_age": longest_age,
+            "OLDEST": OLDEST,
+            "ages": 0 if o.bank is None else o.bank.half.size,
             "rule": {"beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},
             "longest": Screen.of(o).longest,
             "far": RULE.far,

@@ -237,7 +237,8 @@ def assembled(
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[:n] for end in design.recordings.ranges)
-    gaps = FilterBank(r, start, np.ones(n), np.zeros(n), high - low, np.exp([-1 / slowest]))
+    ages = np.ones((min(2, len(at)), n))
+    gaps = FilterBank(r, start, ages, 0 * ages, high - low, np.exp([-1 / slowest]))
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(
@@ -265,5 +266,5 @@ def let_go(observer: Observer, F: Array) -> Observer:
 def settle_samples(systems: Sequence[Filters], recovery: Array) -> int:
     """Return the samples after which a disturbance is below one percent: five of the slowest time constants."""
     poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in systems]
-    slowest = max([*poles, *recovery])
+    slowest = max([*poles, *recovery.ravel()])
     return int(np.ceil(-5 / np.log(slowest))) if slowest > 0 else 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -82,32 +83,36 @@ def with_gaps(
 ) -> FilterBank:
     """Return a filter bank with the ages of gaps that minimise the errors of trials under simulated losses.
 
-    Trials count alike, and do not know their recordings. Measured states have no age: their substitutes are near the
-    fallback always.
+    Errors count by their logarithms, so that gaps of all lengths do; trials do not know their recordings. Gaps of all
+    measurements and, of several, gaps of some have ages of their own. Measured states have none: their substitutes are
+    near the fallback always.
     """
-    n, errors = len(F), list[Array]()
+    n, q = len(F), len(trials[0][0].measured)
     hidden = [i for i in range(n) if i not in trials[0][0].measured]
-    half, recovery = np.full(n, _NEVER), np.zeros(n)
+    half, recovery = np.full(bank.half.shape, _NEVER), np.zeros(bank.half.shape)
     if not hidden:
         return replace(bank, half=half, recovery=recovery)
     rng = np.random.default_rng(settings.seed)
     longest = settings.longest(float(np.median([recordings.length for _, recordings in trials])))
     ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
-    for trial, recordings in trials:
+    errors = np.zeros((len(half), len(T), len(hidden)))
+    for (trial, recordings), kind in product(trials, range(len(half))):
         samples, patterns = (-(-each // len(trials)) for each in (settings.gap_samples, settings.gap_episodes))
         states, y, inputs, own = training(trial, recordings, samples, patterns)
-        lost, some = losses(rng, *y.shape[:2]), rng.random(y.shape[1:]) < 0.5
-        some[np.arange(len(some)), rng.integers(y.shape[2], size=len(some))] = True  # of several sensors some are lost
+        lost, sensors = losses(rng, *y.shape[:2]), np.ones(y.shape[1:], dtype=bool)
+        if kind:
+            sensors = rng.permuted(np.arange(q) < rng.integers(1, q, (len(sensors), 1)), axis=1)
         assert trial.bank is not None
         side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
-        shown = np.where(lost[..., None] & some, np.nan, y)
+        shown = np.where(lost[..., None] & sensors, np.nan, y)
         filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
         filtered[..., list(trial.measured)] = states[..., list(trial.measured)]
         squares = blended_errors(states, filtered, from_inputs, lost, F, hidden, T, mu)
-        errors.append(squares.mean(axis=1))
-    choice = np.log(np.maximum(errors, TINY)).mean(axis=0).argmin(axis=0)
-    half[hidden], recovery[hidden] = T[choice, 0], mu[choice, 0]
+        errors[kind] += np.log(np.maximum(squares, TINY)).mean(axis=1)
+    choice = errors.argmin(axis=1)
+    half, recovery = half.copy(), recovery.copy()
+    half[:, hidden], recovery[:, hidden] = T[choice, 0], mu[choice, 0]
     return replace(bank, half=half, recovery=recovery)
 
 

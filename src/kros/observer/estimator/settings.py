@@ -71,7 +71,7 @@ class EstimatorSettings(Settings):
     )
     settled_share: float = Field(1e-3, gt=0, description="weight of these errors for all other time")
     gap_share: float = Field(
-        1e-3,
+        3e-3,
         ge=0,
         description="weight of the errors that straight lines over lost measurements make, half of them: rows with "
         "target zero, which bound the gains of filters on smooth recordings",

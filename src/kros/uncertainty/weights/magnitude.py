@@ -144,7 +144,7 @@ class Bound:
 
 
 def rising_bounds(tau: AnyArray, magnitude: AnyArray, max_order: int, enough_db: float) -> Iterator[Bound]:
-    """Yield the tightest bounds of positive magnitudes at increasing tau, order by order, or a lower one that is enough.
+    """Yield the tightest bounds of positive magnitudes at increasing tau, by order, or a lower one that is enough.
 
     Further poles and zeros would all but cancel, wherever rounding has them.
     """

@@ -124,7 +124,9 @@ def test_csv_and_parquet_say_the_same_with_units_and_sources(kros, demo, field, 
     recorded = np.concatenate([machines.read(key)[:, [0, 3, 4]] for key in machines.episodes])
     np.testing.assert_allclose(np.column_stack([found[c].to_numpy() for c in SEEN]), recorded, rtol=1e-12)
     np.testing.assert_allclose(found["time_s"].to_numpy(), 1e-3 * found["k"].to_numpy(), rtol=1e-12)
-    assert set(found["status"].to_pylist()) == {"GOOD"}
+    seen = set(zip(found["unit"].to_pylist(), found["status"].to_pylist(), strict=True))
+    bad, *good = (f"m{unit}" for unit in machines.unit_ids)
+    assert seen == {(bad, "GOOD"), (bad, "UNCERTIFIED"), *((unit, "GOOD") for unit in good)}
     stated = json.loads((demo / "metrics.json").read_text())
     bound = stated["observers"][stated["study"]["deployed"]]["set_bound"]
     assert found["velocity_band"].to_pylist()[0] == pytest.approx(bound["velocity"], rel=1e-9)

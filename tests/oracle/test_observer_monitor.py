@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import DT, LIMITS, drive, filters, samples, watched
+from machines import DT, LIMITS, MACHINES, drive, filters, in_python, samples, watched
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
@@ -13,7 +13,7 @@ from kros.design.training import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Observer, SampleStatus
 from kros.observer.monitor import RECOVERY, Monitor, Watch, octaves
-from kros.observer.simulate import run_innovations
+from kros.observer.simulate import Course, run_innovations
 from kros.observer.units import in_sizes
 from kros.plants import HarmonicDrivePopulation
 from kros.synthesis import Injection
@@ -40,6 +40,20 @@ def test_one_machine_is_watched_as_many_at_once(machine, bound):
     outside = (status & SampleStatus.UNCERTIFIED) > 0
     np.testing.assert_array_equal(outside, wanted > 0)
     assert 0.05 < outside.mean() < 0.95
+    course = Course(observer, watch=Watch.of(observer.monitor))
+    blocks = [course.take(y[part, None], u[part, None]).status[:, 0] for part in (slice(300), slice(300, None))]
+    np.testing.assert_array_equal(np.concatenate(blocks), status)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize("kind", MACHINES)
+def test_blocks_and_single_samples_have_the_same_status(kind, lost):
+    """Compiled where no start comes again, else step by step."""
+    observer, (y, u) = MACHINES[kind](), samples(700, faults=lost)
+    course, blocks = Course(observer, watch=Watch.of(observer.monitor)), [slice(k, k + 175) for k in range(0, 700, 175)]
+    found = np.concatenate([course.take(y[block, None], u[block, None]).status[:, 0] for block in blocks])
+    np.testing.assert_array_equal(found, in_python(observer, y, u)[1])
+    assert bool(found.any()) == (lost or "limits" in kind or "monitor" in kind)
 
 
 def test_bands_pass_the_power_that_their_filters_say():
@@ -150,7 +164,7 @@ def test_the_bound_is_that_of_one_more_unit():
         innovation, _ = run_innovations(observer, r[:, None, :1], r[:, None, 3:], settle=0)
         course = []
         for k, nu in enumerate(innovation[:, 0]):
-            watch.take(nu, bad=False, start=k == 0, moving=True)
+            watch.take(nu[None], *(np.array([flag]) for flag in (False, k == 0, True)))
             course.append(watch.level_db)
         found[key] = max(course)
     peaks = np.array([[v for key, v in found.items() if key.unit == unit] for unit in population.unit_ids])

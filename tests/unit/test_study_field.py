@@ -9,7 +9,7 @@ import pytest
 
 from kros.data import Channel, Role, from_arrays
 from kros.lifting import Lifting
-from kros.observer import Observer
+from kros.observer import Observer, SampleStatus
 from kros.observer.monitor import Monitor, octaves
 from kros.report.unit_verdicts import html_text, junit_text, verdict_lines, with_verdict, worst
 from kros.study.commands.check import errors_beside_bounds, monitored
@@ -45,6 +45,8 @@ def test_a_unit_beyond_the_bound_is_an_outlier_where_enough_units_made_it(
     (row,) = monitored(recordings(units, noise))
     assert (row["outlier"], row["score"], row["missing"]) == (outlier, None, ["velocity"])
     assert (row["level_db"] > 0) == (noise == 100.0)
+    ((_, _, _, status, _),) = recordings(units, noise).estimates()
+    assert bool((status & SampleStatus.UNCERTIFIED).any()) == (noise == 100.0)
     assert row["status"] == ("outlier" if outlier else "cannot tell")
     row = with_verdict(row)
     assert row["verdict"] == ("FAIL" if outlier else "UNDECIDED")

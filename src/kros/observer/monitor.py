@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import AnyArray, Array, DataError, Flags, frozen
+from ..core import Array, DataError, Flags, frozen
 from .checked import floats
 
 LARGEST = 1e3  # sizes of the innovation that count at most
@@ -66,12 +66,7 @@ class Monitor:
 
     def mean_squares(self, innovation: Array, judged: Flags) -> Array:
         """Return mean squares of a machine, (n_samples, q, bands), after every sample; those not judged change none."""
-        from scipy.signal import lfilter
-
-        scaled = self.scaled(innovation[judged])
-        bands = [lfilter([b, 0, -b], [1, a1, a2], scaled, axis=0) for b, a1, a2 in self.filters]
-        means = self._remembered(np.stack(bands, axis=-1) ** 2)
-        return np.concatenate([np.zeros((1, *self.limits.shape)), means])[np.cumsum(judged)]
+        return Watch(self).mean_squares(innovation, judged)
 
     def scaled(self, innovation: Array) -> Array:
         """Return innovations (..., q) over their sizes, within what counts at most."""
@@ -82,19 +77,6 @@ class Monitor:
         """Return the mean squares of episodes, (n_samples, q, bands), that a machine has one after the other."""
         innovation, judged = (np.concatenate(parts) for parts in zip(*episodes, strict=True))
         return np.split(self.mean_squares(innovation, judged), np.cumsum([len(own) for _, own in episodes])[:-1])
-
-    def _remembered(self, squares: Array) -> Array:
-        """Return the means of squares, shape (n_samples, q, bands), after every sample."""
-        from scipy.signal import lfilter
-
-        first, keep = max(self.first, self.forget), 1 - self.forget
-        falling = min(len(squares), int(np.ceil(1 / self.forget - 1 / first)))  # until the gain stays as it is
-        begun = np.cumsum(squares[:falling], axis=0) / (1 / first + np.arange(falling))[:, None, None]
-        if falling == len(squares):
-            return begun
-        last = keep * begun[-1:] if falling else np.zeros((1, *squares.shape[1:]))
-        rest, _ = lfilter([self.forget], [1, -keep], squares[falling:], axis=0, zi=last)
-        return np.concatenate([begun, rest])
 
     def level(self, mean_squares: Array) -> Array:
         """Return the level over the bound in dB, (...), of mean squares (..., q, bands)."""
@@ -109,16 +91,15 @@ def octaves(count: int = 6) -> Array:
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
 
 
-def judged_samples(settle: int, status: AnyArray, starts: Flags, moving: Flags) -> Flags:
-    """Return which samples are judged, as a running observer does it; status and flags (n_samples, batch)."""
-    judged, wait = np.zeros(status.shape, dtype=bool), np.zeros(status.shape[1], dtype=int)
-    bad, quiet = status != 0, np.arange(len(status))[:, None]
-    events = np.flatnonzero((bad | starts | ~moving).any(axis=1))  # the first sample, which is a start, is one
-    for k, stop in pairwise([*events, len(status)]):
+def judged_samples(settle: int, bad: Flags, starts: Flags, moving: Flags, wait: Any = 0) -> tuple[Flags, Any]:
+    """Return which samples are judged, flags (n_samples, batch) of `judge`, and how many more machines are not."""
+    judged, wait, quiet = np.zeros(bad.shape, dtype=bool), wait + np.zeros(bad.shape[1], int), np.arange(len(bad))
+    events = np.flatnonzero((bad | starts | ~moving).any(axis=1))
+    for k, stop in pairwise([0, *events[events > 0], len(bad)]):
         judged[k], wait = judge(wait, settle, bad[k], starts[k], moving[k])
-        judged[k + 1 : stop] = quiet[: stop - k - 1] >= wait
+        judged[k + 1 : stop] = quiet[: stop - k - 1, None] >= wait
         wait = np.maximum(wait - (stop - k - 1), 0)
-    return judged
+    return judged, wait
 
 
 def judge(wait: Any, settle: int, bad: Any, start: Any, moving: Any) -> tuple[Any, Any]:
@@ -133,28 +114,64 @@ class Watch:
 
     def __init__(self, monitor: Monitor) -> None:
         self._monitor = monitor
-        self.reset()
+        self.begin()
 
-    def reset(self) -> None:
+    @classmethod
+    def of(cls, monitor: Monitor | None) -> Watch | None:
+        """Return the watch of an observer that has a monitor."""
+        return None if monitor is None else cls(monitor)
+
+    def begin(self) -> None:
         """Forget everything."""
         self._filters, self._squares = np.zeros((2, *self._monitor.limits.shape)), np.zeros(self._monitor.limits.shape)
-        self._gain, self.outside = max(self._monitor.first, self._monitor.forget), False
-        self._wait: Any = self._monitor.settle
+        self._gain, self._wait = max(self._monitor.first, self._monitor.forget), self._monitor.settle
 
-    def take(self, innovation: Array, bad: Any, start: Any, moving: Any) -> None:
-        """Take the innovation of every channel, (q,); the flags are those of `judge`."""
-        judged, self._wait = judge(self._wait, self._monitor.settle, bad, start, moving)
-        if not judged:
-            return
-        b, a1, a2 = self._monitor.filters.T
-        driven = b * self._monitor.scaled(innovation)[:, None]
-        bands = driven + self._filters[0]
-        self._filters = np.stack([self._filters[1] - a1 * bands, -driven - a2 * bands])
-        self._squares = self._squares + self._gain * (bands**2 - self._squares)
-        self._gain = max(self._gain / (1 + self._gain), self._monitor.forget)
-        self.outside = self.level_db > 0
+    def take(self, innovation: Array, bad: Flags, starts: Flags, moving: Flags) -> Flags:
+        """Return after which samples, (n_samples,), it is outside; innovation (n_samples, q), flags of `judge`."""
+        monitor = self._monitor
+        if len(bad) > 1:
+            bad, starts, moving = (of[:, None] for of in (bad, starts, moving))
+            judged, (self._wait,) = judged_samples(monitor.settle, bad, starts, moving, self._wait)
+            return np.asarray(monitor.level(self.mean_squares(innovation, judged[:, 0])) > 0)
+        judged, self._wait = judge(self._wait, monitor.settle, bad[0], starts[0], moving[0])
+        if judged:  # the same without `lfilter`, which would take longer than the step
+            b, a1, a2 = monitor.filters.T
+            driven = b * monitor.scaled(innovation[0])[:, None]
+            bands = driven + self._filters[0]
+            self._filters = np.stack([self._filters[1] - a1 * bands, -driven - a2 * bands])
+            self._squares = self._squares + self._gain * (bands**2 - self._squares)
+            self._gain = max(self._gain / (1 + self._gain), monitor.forget)
+        return np.array([self.level_db > 0])
+
+    def mean_squares(self, innovation: Array, judged: Flags) -> Array:
+        """Return mean squares, (n_samples, q, bands), after every sample; those not judged change none."""
+        from scipy.signal import lfilter
+
+        scaled, before = self._monitor.scaled(innovation[judged]), self._squares[None]
+        bands = np.empty((*scaled.shape, len(self._monitor.filters)))
+        for i, (b, a1, a2) in enumerate(self._monitor.filters):
+            state = self._filters[..., i]
+            bands[..., i], state[...] = lfilter([b, 0, -b], [1, a1, a2], scaled, axis=0, zi=state)
+        means = np.concatenate([before, self._remembered(bands**2)])
+        self._squares = means[-1]
+        return means[np.cumsum(judged)]
+
+    def _remembered(self, squares: Array) -> Array:
+        """Return the means of squares, shape (n_samples, q, bands), after every sample."""
+        from scipy.signal import lfilter
+
+        forget, least = self._monitor.forget, 1 / self._gain
+        falling = min(len(squares), int(np.ceil(1 / forget - least)))  # until the gain stays as it is
+        sums = self._squares * (least - 1) + np.cumsum(squares[:falling], axis=0)
+        begun = sums / (least + np.arange(falling))[:, None, None]
+        self._gain = max(1 / (least + falling), forget)
+        if falling == len(squares):
+            return begun
+        last = (1 - forget) * (begun[-1:] if falling else self._squares[None])
+        rest, _ = lfilter([forget], [1, forget - 1], squares[falling:], axis=0, zi=last)
+        return np.concatenate([begun, rest])
 
     @property
     def level_db(self) -> float:
-        """Level of the innovation over its bound, dB; far below zero before anything was judged."""
+        """Level of the innovation over its bound in dB; far below zero before anything was judged."""
         return float(self._monitor.level(self._squares))

@@ -63,8 +63,10 @@ class RunningObserver:
 
     def __init__(self, observer: ObserverData, y: ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
-        self._screen, self._course = Screen.of(observer), Course(observer, 1, parameters)
-        self._watch = None if observer.monitor is None else Watch(observer.monitor)
+        self._screen, self._course = (
+            Screen.of(observer),
+            Course(observer, 1, parameters, watch=Watch.of(observer.monitor)),
+        )
         self.parameters = parameters
         self.reset(y)
 
@@ -101,7 +103,7 @@ class RunningObserver:
     @property
     def level_db(self) -> float | None:
         """Level of the innovation over its bound in dB, above zero outside; None without a monitor."""
-        return None if self._watch is None else self._watch.level_db
+        return None if self._course.watch is None else self._course.watch.level_db
 
     def reset(self, y: ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
@@ -109,8 +111,6 @@ class RunningObserver:
         self._status = SampleStatus(int(first.status[0, 0]))
         self._fresh = self.observer.bank is not None or bool(self._screen.enough(np.isfinite(first.y)).all())
         self._course.begin(first)
-        if self._watch is not None:
-            self._watch.reset()
 
     @cached_property
     def _filter_gain(self) -> Array:
@@ -154,7 +154,7 @@ class RunningObserver:
         DataError
             When they are no numbers.
         """
-        course, watch, bank = self._course, self._watch, self.observer.bank
+        course, bank = self._course, self.observer.bank
         sample = self._sample(y, u, course.held)
         if self._fresh:  # it was started at this sample, filter banks without its inputs
             sample = replace(sample, starts=np.full((1, 1), bank is not None))
@@ -162,13 +162,7 @@ class RunningObserver:
         run = stepped(course, sample)
         if course.loop is not None:
             course.values[course.loop.name] = course.values[course.loop.name][0]
-        if watch is not None:
-            watch.take(run.innovation[0, 0], sample.status[0, 0] != 0, run.starts[0, 0], run.moving[0, 0])
-        self._status = SampleStatus(int(sample.status[0, 0] | run.status[0, 0]))
-        if run.moving[0, 0] and not course.steps.waiting[0] and self.observer.runtime.binds(course.steps.x[0]):
-            self._status |= SampleStatus.LIMIT
-        if watch is not None and watch.outside:
-            self._status |= SampleStatus.UNCERTIFIED
+        self._status = SampleStatus(int(course.bits(sample, run)[0, 0]))
         return self.estimate
 
     def _sample(self, y: ArrayLike | None, u: ArrayLike | None = None, held: Held | None = None) -> Screened:

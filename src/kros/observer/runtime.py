@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..core import Array, DataError, frozen
+from ..core import Array, DataError, Flags, frozen
 from .checked import floats
 
 
@@ -98,10 +98,10 @@ class Runtime:
         limits = self.limits()
         return limits.get("lower", np.full(n, -np.inf))[:n], limits.get("upper", np.full(n, np.inf))[:n]
 
-    def binds(self, x: Array) -> bool:
-        """Whether an estimate, (n,), meets a limit."""
-        low, high = self.sides(len(x))
-        return bool(np.any((x <= low) | (x >= high)))
+    def binds(self, x: Array) -> Flags:
+        """Return which estimates, (..., n), meet a limit."""
+        low, high = self.sides(x.shape[-1])
+        return np.asarray(((x <= low) | (x >= high)).any(axis=-1))
 
     def clip_estimate(self, x: Array, out: Array | None = None) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.arrays import Array, Bits, Flags, Index, Parameters, frozen
 from ..loops import Library, formulas, library
 from .data import ObserverData
-from .monitor import judged_samples
+from .monitor import Watch, judged_samples
 from .runtime import bounds
 from .screen import Held, SampleStatus, Screened, screened
 from .step import Steps, forward
@@ -78,9 +78,10 @@ def run_innovations(
     observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, settle: int = 0
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
-    run = Course(observer, y.shape[1], parameters).take(y, u)
+    samples = screened(observer, y, u)
+    (run,) = _run([Course(observer, y.shape[1], parameters)], samples)
     run.starts[0] = True
-    return run.innovation, judged_samples(settle, run.status, run.starts, run.moving)
+    return run.innovation, judged_samples(settle, samples.status != 0, run.starts, run.moving)[0]
 
 
 def _run(courses: Sequence[Course], samples: Screened) -> list[Stepped]:
@@ -100,7 +101,7 @@ class Stepped:
 
     estimates: Array  # (n_samples, batch, n)
     innovation: Array  # (n_samples, batch, q)
-    status: Bits  # (n_samples, batch): RESTARTED, or nothing
+    status: Bits  # (n_samples, batch): RESTARTED, and LIMIT where the step ended at one
     starts: Flags  # (n_samples, batch)
     moving: Flags  # (n_samples, batch)
     followed: Array  # (n_samples, batch): the parameter that a loop follows
@@ -115,7 +116,9 @@ class Course:
         batch: int = 1,
         parameters: Parameters | None = None,
         loop: Any = None,
+        watch: Watch | None = None,  # of one machine
     ) -> None:
+        self.watch = watch
         self.values: dict[str, Any] = {k: v + np.zeros(batch) for k, v in observer.values(parameters, (batch,)).items()}
         self.observer, self.loop, self.steps = observer, loop, Steps(observer, batch, self.values)
         self.settling = np.zeros(batch, dtype=int)  # samples until a start has settled
@@ -137,14 +140,23 @@ class Course:
         self.steps.begin(first.y[0])
         self.settling[:], self.since[:] = 0, -1
         self._before = replace(first.rows(slice(0)), held=Held.nothing(*first.u.shape[1:]))
-        if self.loop is not None:
-            self.loop.begin()
+        for part in (self.loop, self.watch):
+            if part is not None:
+                part.begin()
 
     def take(self, y: Array, u: Array) -> Stepped:
         """Run over the next samples, y (n_samples, batch, q) and u (n_samples, batch, m), with the bits of all."""
         samples = screened(self.observer, y, u, self.held)
         (run,) = _run([self], samples)
-        return replace(run, status=run.status | samples.status)
+        return replace(run, status=self.bits(samples, run))
+
+    def bits(self, samples: Screened, run: Stepped) -> Bits:
+        """Return the status of samples, of a machine that is watched too."""
+        if self.watch is None:
+            return samples.status | run.status
+        flags = (samples.status != 0, run.starts, run.moving)
+        outside = self.watch.take(run.innovation[:, 0], *(of[:, 0] for of in flags))
+        return samples.status | run.status | np.where(outside, np.uint8(SampleStatus.UNCERTIFIED), 0)[:, None]
 
     def even(self, samples: Screened) -> bool:
         """Whether machines go on side by side: none starts again, settles, follows or looks far back."""
@@ -182,6 +194,7 @@ def stepped(course: Course, samples: Screened) -> Stepped:
     earlier = np.zeros((n_samples, batch, len(observer.lifting.window.earlier)))
     starts, moving, status = samples.starts.copy(), np.zeros(nu.shape[:2], dtype=bool), np.zeros(nu.shape[:2], np.uint8)
     pending, followed = np.zeros((n_samples, batch), dtype=np.intp), np.empty(nu.shape[:2])
+    taken = moving.copy()
     x[:lead] = steps.x
     for k in range(lead, n_samples):
         y, u = samples.y[k], samples.u[k]
@@ -202,12 +215,21 @@ def stepped(course: Course, samples: Screened) -> Stepped:
         else:
             followed[k] = values[loop.name]
             values[loop.name] = loop.step(steps, y, u)
+        taken[k] = moving[k] & ~steps.waiting
         status[k][steps.waiting | (course.settling > 0)] = SampleStatus.RESTARTED
         course.settling = np.where(steps.waiting, settle, np.maximum(course.settling - 1, 0))
     course.leave(samples)
+    status |= _limited(observer, x, steps.x, taken)
     if d:
         _predict(observer, x, earlier, pending, samples, values)
     return Stepped(x[lead:], nu[lead:], status[lead:], starts[lead:], moving[lead:], followed[lead:])
+
+
+def _limited(observer: ObserverData, x: Array, last: Array, taken: Flags) -> Bits:
+    """Return LIMIT where a step that was taken ended at one; states (n_samples, batch, n), and those after the last."""
+    x, last = x[1:, :, : len(observer.recorded)], last[None, :, : len(observer.recorded)]
+    met = observer.runtime.binds(np.concatenate([x, last]) if len(x) else last)
+    return np.where(taken & met, np.uint8(SampleStatus.LIMIT), 0)
 
 
 def _predict(
@@ -252,12 +274,12 @@ def _compiled(loops: Library, courses: Sequence[Course], samples: Screened) -> l
         course.since[:] = late[-1]
         course.leave(samples)
         innovation = np.where(np.isfinite(samples.y), samples.y - x[..., list(observer.measured)], 0.0)
+        status = _limited(course.observer, x[lead:], steps.x, moving)
         if delay:
             pending = np.broadcast_to(late[:, None], (n_samples, batch))
             with np.errstate(over="ignore", invalid="ignore"):
                 _predict(course.observer, x, np.empty((n_samples, batch, 0)), pending, samples, values)
-        status, starts = np.zeros((2, n_samples - lead, batch), np.uint8)
-        runs.append(Stepped(x[lead:], innovation[lead:], status, starts.view(bool), moving, np.empty(0)))
+        runs.append(Stepped(x[lead:], innovation[lead:], status, np.zeros_like(moving), moving, np.empty(0)))
     return runs
 
 

@@ -28,6 +28,7 @@ from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
 from ...identify.calibration import Texts, Values, unit_values
 from ...observer import Observer, SampleStatus
+from ...observer.monitor import Watch
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import Stage, StudyConfig, validate_config
@@ -199,7 +200,7 @@ class FieldRecordings:
             recorded = self.population.read(key)
             arrived = arriving(observer, self.population, {key: recorded}, self.values)
             loop = None if self.name is None else PhaseLockedLoop(observer, self.name, 1)
-            course = Course(observer, 1, arrived.parameters, loop)
+            course = Course(observer, 1, arrived.parameters, loop, Watch.of(observer.monitor))
             for block in pieces(len(recorded), _BLOCK):
                 run = course.take(arrived.y[block], arrived.u[block])
                 columns = run.estimates[:, 0, : len(observer.recorded)]
@@ -209,5 +210,5 @@ class FieldRecordings:
 
 
 def status_counts(status: Bits) -> Counter[str]:
-    """Return how many samples are missing, invalid, beyond limits, or restart the observer."""
+    """Return how many samples have each bit."""
     return +Counter({str(bit.name): int(np.count_nonzero(status & bit)) for bit in SampleStatus})

@@ -142,6 +142,14 @@ def test_errors_stand_beside_bounds_with_the_change_of_gain_that_they_exclude() 
     assert (good["state"], good["unit"], good["bound"]) == ("velocity", "m/s", bound)
     assert good["ratio"] < 1e-9
     assert bad["rms"] == pytest.approx(0.6 * float(np.sqrt((x[:, 1] ** 2).mean())))
-    assert (good["gain_percent"], bad["gain_percent"]) == (pytest.approx(50.0), pytest.approx(125.0))
+    assert good["gain_percent"] == pytest.approx(50.0)
+
+    def row_of(gain: float) -> dict[str, float]:
+        unit = from_arrays({"u": [whole * (1.0, gain, 1.0)]}, channels, 0.01)
+        return errors_beside_bounds(context, unit, {"u": {}})["u", "default"][0]
+
+    change = 1.01 * row_of(1.2)["gain_percent"] / 100  # the error is a part of the state
+    assert row_of(1.2)["ratio"] < 1
+    assert all(row_of(1.2 * (1 + sign * change))["ratio"] > 1 for sign in (-1, 1))
     context.observers_record = {"facts": {}}
     assert errors_beside_bounds(context, population, {}) == {}

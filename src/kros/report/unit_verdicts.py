@@ -57,14 +57,18 @@ class Verdict(StrEnum):
 
 def with_verdict(row: Record) -> Record:
     """Return a row of scores with its verdict and the reason in words."""
-    error, gains = row.get("error"), row.get("detectable") or {}
-    ratio = error["ratio"] if error else 0.0
-    within = ratio is not None and ratio <= 1 and all(p <= OUTLIER.passed_percent for p in gains.values())
-    verdict = Verdict.PASS if row["status"] == Status.OK and within else Verdict.UNDECIDED
-    beyond = error and row["units"] >= FEWEST_UNITS and (ratio is None or ratio > OUTLIER.failed)
+    passed = all(p <= OUTLIER.passed_percent for p in (row.get("detectable") or {}).values()) and _within(row)
+    verdict = Verdict.PASS if row["status"] == Status.OK and passed else Verdict.UNDECIDED
+    beyond = not _within(row, OUTLIER.failed) and row["units"] >= FEWEST_UNITS
     verdict = Verdict.FAIL if row["outlier"] or beyond else verdict
     row = row | {"verdict": verdict}
     return row | {"reason": "; ".join(_reasons(row))}
+
+
+def _within(row: Record, factor: float = 1.0) -> bool:
+    """Whether the error is at most a factor times its bound, where there is one."""
+    error = row.get("error") or {"ratio": 0.0}
+    return error["ratio"] is not None and error["ratio"] <= factor
 
 
 def by_unit(rows: Sequence[Record]) -> dict[str, tuple[Verdict, list[str]]]:
@@ -129,7 +133,7 @@ def _reasons(row: Record) -> list[str]:
     elif row["status"] == Status.OTHER_MOTIONS:
         less = "beyond the others, but by no more than one unit differs from motion to motion"
         reasons.append(f"{less}; repeat the motions of the study")
-    elif (gains := row.get("detectable")) and row["verdict"] is not Verdict.FAIL:
+    elif (gains := row.get("detectable")) and not row["outlier"] and _within(row):
         state, percent = max(gains.items(), key=itemgetter(1))
         only = "only " if row["status"] == Status.CANNOT_TELL or percent > OUTLIER.passed_percent else ""
         reasons.append(f"{only}a change of the gain of {words(state)} above {number(percent, 2)} % would be detected")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 from urllib.parse import quote
@@ -93,7 +94,7 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
 def errors_beside_bounds(context: Context, population: Population, values: Values) -> dict[tuple[str, str], Rows]:
     """Return errors of the deployed observer in hidden states beside its bounds, by unit, in the models' condition.
 
-    A change of a state's gain that adds as much to the error as the bound is would be detected.
+    A change of a state's gain adds a part of the state to the error. That part may be in the error already.
     """
     home, observer = context.facts.identify_on, context.deployed
     bounds = context.observers_record["facts"].get(observer.name, {}).get("set_bound", {})
@@ -101,17 +102,27 @@ def errors_beside_bounds(context: Context, population: Population, values: Value
     if home not in population.conditions or not states:
         return {}
     episodes = HeldOut(population, population.keys(condition=home), values, sensor=context.config.sensor)
-    (outcome,) = episodes.observers([observer])
     errors = dict[tuple[str, str], Rows]()
-    for (unit, _), keys in episodes.groups.items():
-        moves = np.sqrt(np.mean([population.read(key).var(axis=0) for key in keys], axis=0))
+    for place, keys in episodes.groups.items():
+        (outcome,) = replace(episodes, keys=tuple(keys), shown=tuple(keys)).observers([observer])
+        parts = np.mean([_parts(outcome.shown[key], population.read(key)) for key in keys], axis=0)
         for name in states:
             i, bound = population.states.index(name), bounds[name]
-            rms = float(np.mean([outcome.errors[key][i]["rms"] for key in keys]))
+            (size, along, apart), rms = parts[:, i], float(np.mean([outcome.errors[key][i]["rms"] for key in keys]))
+            gain = float((abs(along) + np.sqrt(max(bound**2 - apart**2, 0.0))) / max(size, TINY))
             row = {"state": name, "rms": rms, "bound": bound, "ratio": rms / bound, "unit": population.channels[i].unit}
-            row["gain_percent"] = 100 * bound / max(float(moves[i]), TINY)
-            errors.setdefault((unit, home), Rows()).append(row)
+            errors.setdefault(place, Rows()).append(row | {"gain_percent": 100 * gain})
     return errors
+
+
+def _parts(estimate: Array, recorded: Array) -> Array:
+    """Return sizes of states about their means, and of the error along with them and apart from them, (3, n)."""
+    recorded = recorded[:, : estimate.shape[1]]
+    with np.errstate(over="ignore", invalid="ignore"):
+        moves, error = recorded - recorded.mean(axis=0), recorded - estimate
+        size = moves.std(axis=0)
+        along = (error * moves).mean(axis=0) / np.maximum(size, TINY)
+        return np.stack([size, along, np.sqrt(np.maximum((error**2).mean(axis=0) - along**2, 0.0))])
 
 
 def score_condition(

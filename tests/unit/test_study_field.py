@@ -7,12 +7,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from kros.core import DataError
 from kros.data import Channel, Role, from_arrays
 from kros.lifting import Lifting
 from kros.observer import Observer, SampleStatus
 from kros.observer.monitor import Monitor, octaves
 from kros.report.unit_verdicts import html_text, junit_text, verdict_lines, with_verdict, worst
-from kros.study.commands.check import errors_beside_bounds, monitored
+from kros.study.commands.check import check_recordings, errors_beside_bounds, monitored
 from kros.study.commands.field import FieldRecordings
 from kros.uncertainty.outliers.score import FEWEST_UNITS as FEWEST
 
@@ -85,6 +86,19 @@ def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_t
     assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == ("3", "1", "1")
     assert [[child.tag for child in case] for case in suite] == [[], ["error"], ["failure"]]
     assert suite[1].attrib["name"] == '<b "__&'
+
+
+def test_recordings_of_new_units_are_looked_at_as_those_of_a_study_are(caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(0)
+    first, other = (np.cumsum(rng.normal(size=(200, 2)), axis=0) for _ in range(2))
+    check_recordings(from_arrays({"a": [first, other]}, CHANNELS, 0.01))
+    assert not caplog.records
+    with pytest.raises(DataError, match="is a copy of episode 0 of unit a"):
+        check_recordings(from_arrays({"a": [first, first.copy()]}, CHANNELS, 0.01))
+    other[100, 0] += 1e3
+    check_recordings(from_arrays({"a": [first * (1, 0) + (0, 2), other * (1, 0) + (0, 2)]}, CHANNELS, 0.01))
+    assert "input 'force' stays where it is in each of 2 episodes, in the first at 2" in caplog.text
+    assert "Episode 1 of unit a (default): position jumps by" in caplog.text
 
 
 SCORED = {

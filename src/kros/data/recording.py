@@ -254,10 +254,10 @@ class GroupWatch:
                 most = f"98 % of its samples are from {low[i]:g} to {high[i]:g}"
                 yield key, f"channel {self._channels[i].name!r} is {actual}, and {most}"
 
-    def check(self) -> None:
-        """Raise DataError for wild samples, and for an input or a state that never changed."""
+    def problems(self) -> Iterator[str]:
+        """Yield a sentence for all wild samples, and for every input or state that never changed."""
         for key, problem in self.wild():
-            raise DataError(f"{title(key)}: {problem}; fix the source, or leave the episode out.")
+            yield f"{title(key)}: {problem}; fix the source, or leave the episode out."
         rests = np.array([look[-1] for look in self._looks.values()]).T
         for channel, rest in zip(self._channels, rests, strict=False):
             differs = channel.role is Role.INPUT and (rest != rest[0]).any()  # from episode to episode
@@ -266,7 +266,7 @@ class GroupWatch:
             key = next(iter(self._looks))
             what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays where it is"
             place = f"in each of {len(rest)} episodes, in the first at {rest[0]:g}"
-            raise DataError(f"{what} {place}; check the sensor and the column, or remove the channel or the unit.")
+            yield f"{what} {place}; check the sensor and the column, or remove the channel or the unit."
 
 
 def check_names(kind: str, names: Iterable[Any]) -> None:
@@ -344,7 +344,8 @@ def usable_episodes(population: Population, on_nan: str = "error") -> Iterator[t
         watch.add(key, values)
         usable += 1
         yield key, values, digest_of(values)
-    watch.check()
+    for problem in watch.problems():
+        raise DataError(problem)
     if not usable:
         group = f"Unit {key.unit} ({key.condition})"
         raise DataError(f"{group}: every episode was dropped; fix the source or leave the unit out.")

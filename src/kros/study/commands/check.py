@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections import Counter
 from dataclasses import replace
@@ -12,13 +13,15 @@ from urllib.parse import quote
 import numpy as np
 
 from ...core import TINY, Array, ConfigError, DataError, Executor, Flags, plain
-from ...data import Population
-from ...data.recording import check_population
+from ...data import EpisodeKey, Population
+from ...data.prepare import with_gaps
+from ...data.recording import GroupWatch, check_population, digest_of, refuse_copies, title
 from ...evaluate.held_out import HeldOut
 from ...identify import ModelSet
 from ...identify.calibration import Values, training_keys, unit_parameters
 from ...identify.factors import reduce_episodes
 from ...identify.identified import EpisodeFactors
+from ...identify.likeness import course, odd
 from ...observer import run_innovations, screened
 from ...report.unit_verdicts import Rows, with_verdict
 from ...uncertainty import OutlierModel
@@ -29,6 +32,7 @@ from ..engine.executors import open_executor
 from ..engine.store import DEPLOYED
 from .field import STAGES, FieldRecordings, check_channels, hidden_states, open_data, status_counts
 
+log = logging.getLogger(__name__)
 Judged = list[tuple[Array, Flags]]  # innovations, and which samples are judged
 
 
@@ -54,6 +58,7 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     observer = context.deployed if store.holds(*DEPLOYED) else None
     population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
+    check_recordings(with_gaps(population))
     watched, errors = Rows(), dict[tuple[str, str], Rows]()
     if observer is not None:
         recordings = FieldRecordings.open(context, data)
@@ -89,6 +94,22 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
             gains = {e["state"]: e["gain_percent"] for e in beside}
             row["detectable"] = {s: min(p, gains.get(s, np.inf)) for s, p in row["detectable"].items()}
     return rows
+
+
+def check_recordings(population: Population) -> None:
+    """Refuse copies as a study does, and warn of all else that it refuses or warns of."""
+    seen, alerts = dict[EpisodeKey, tuple[str, Array]](), list[str]()
+    for _, _, keys in population.groups():
+        watch = GroupWatch(population.columns)
+        for key in keys:
+            values = population.source(key)
+            watch.add(key, values)
+            seen[key] = digest_of(values), course(values)[:, : len(population.states)]
+        alerts += watch.problems()
+    refuse_copies((key, digest) for key, (digest, _) in seen.items())
+    alerts += odd([title(key) for key in seen], population.states, np.array([of for _, of in seen.values()]))
+    for alert in alerts:
+        log.warning("%s", alert)
 
 
 def errors_beside_bounds(context: Context, population: Population, values: Values) -> dict[tuple[str, str], Rows]:

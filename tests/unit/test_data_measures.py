@@ -44,6 +44,23 @@ def test_si(text: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "text", "si", "factor"),
+    [
+        ("Body accel.", "g", "m/s^2", 9.80665),
+        ("beschleunigung_x", "mg", "m/s^2", 9.80665e-3),
+        ("Füllmenge", "g", "kg", 1e-3),
+        ("temp", "F", "K", 5 / 9),
+        ("Motor torque", "nm", "N m", 1.0),
+        ("gap", "nm", "m", 1e-9),
+    ],
+)
+def test_symbols_with_several_meanings_have_that_of_the_channel(name: str, text: str, si: str, factor: float) -> None:
+    found = measure(text, name)
+    assert found is not None
+    assert (found.si, found.factor) == (si, pytest.approx(factor, rel=1e-9))
+
+
+@pytest.mark.parametrize(
     "text", ["", "%", "1", "counts", "dBm", "l/min", "foo", "9**9**9**9", "m/", "__import__('os')", "m^99", "x" * 10000]
 )
 def test_what_is_not_converted(text: str) -> None:

@@ -33,6 +33,7 @@ hex dez s sec seconds sek ms msec us µs μs ns min h
 _MORE = """
 degree degrees radian meter metre millimeter second minute hour volt amp amps ampere newton pascal watt kelvin celsius
 degree_Celsius volts hertz kHz MHz GPa kWh mW MW uA uV nA nm mH uH Ohm mF uF nF mT mbar torr atm lbf ft lb t
+gravity milligravity
 """  # that pint knows too
 _QUANTITIES = {
     "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl ref reference "
@@ -52,6 +53,12 @@ _QUANTITIES = {
     "pressure": "pressure druck p pression oeldruck",
     "temperature": "temp temperature temperatur",
     "voltage": "volt voltage spannung tension",
+}
+# symbols that mean something else in channels of one kind, by name
+_OF_KIND = {
+    "acceleration": {"g": "gravity", "G": "gravity", "mg": "milligravity"},
+    "temperature": {"F": "degF", "f": "degF"},
+    "torque": {"nm": "N*m", "NM": "N*m"},
 }
 _OF_WORD = {word: kind for kind, words in _QUANTITIES.items() for word in words.split()}
 _LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
@@ -109,8 +116,9 @@ def _in_base(registry: Any, value: float, unit: str) -> Any:
 
 
 @cache
-def measure(unit: str) -> Measure | None:
-    """Return what a text measures; None where it is no unit of a quantity that kros writes in SI."""
+def measure(unit: str, name: str = "") -> Measure | None:
+    """Return what a text measures in a channel of a name; None where it is no unit that kros converts to SI."""
+    unit = _OF_KIND.get(_named_kind(name), {}).get(bare(unit), unit)
     text = re.sub(r"(?<=[a-zA-Z])([23])$", r"^\1", bare(unit).replace("²", "^2").replace("³", "^3").replace("·", "*"))
     text = _PINT.get(text, _PINT.get(text.lower().replace(" ", ""), text))
     return _measured(text) or (_measured(text.lower()) if len(text) > 2 else None)  # Volts, RPM
@@ -162,10 +170,14 @@ def words_of(name: str) -> list[str]:
 
 def kind_of(name: str, unit: str = "") -> str:
     """Return the kind of quantity that a channel is, by its unit of measure or its name, or nothing."""
-    known = measure(unit)
+    known = measure(unit, name)
     kind = "other" if known is None else KINDS[known.si]
-    quantities = (of for of in words_of(name) if of not in ("", "input", "spare"))
-    return next(quantities, "") if kind == "other" else kind
+    return _named_kind(name) if kind == "other" else kind
+
+
+def _named_kind(name: str) -> str:
+    """Return the kind of quantity that a name has a word for, or nothing."""
+    return next((of for of in words_of(name) if of not in ("", "input", "spare")), "")
 
 
 def split_header(text: str) -> tuple[str, str]:

@@ -68,7 +68,7 @@ def describe(table: Table) -> list[TableColumn]:
         unit = clean_unit(stated) or clean_unit(written)
         name = header if header.isidentifier() and not written else stem
         name = identifier(f"column_{name}" if name.isdigit() else name, [*KEYS, "k", *(c.name for c in columns)])
-        known = measure(unit) or Measure(unit, 1.0, 0.0)
+        known = measure(unit, stem) or Measure(unit, 1.0, 0.0)
         if known.offset:  # a temperature whose zero is not that of K
             known = Measure("degC", known.factor, known.offset - ZERO_OF_CELSIUS)
         about = known.si, known.factor, known.offset, unit, kind_of(stem, unit)

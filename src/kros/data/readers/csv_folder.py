@@ -347,7 +347,7 @@ def _conversion(table: Table, at: int, column: Column, declared: str, known: dic
     usual = declared or (known.setdefault(column, stated) if stated else "")
     if not stated or clean_unit(usual) == stated:
         return 1.0, 0.0
-    ours, theirs = measure(usual), measure(stated)
+    ours, theirs = (measure(text, table.fields[at]) for text in (usual, stated))
     if not declared and (None in (ours, theirs) or ours == theirs):
         return 1.0, 0.0
     if not declared or ours is None or theirs is None or ours.si != theirs.si:

@@ -65,7 +65,8 @@ class RunResult(Shown):
             return {"units": units, "check": " ".join(facts.study.get("alerts", ())), **place}
         verdict = judge(facts)
         numbers = {n.label: f"{n.value} {n.unit} ({'; '.join(n.notes[1:] or n.notes)})" for n in verdict.numbers}
-        return {verdict.status.value: verdict.sentence, **numbers, **place}
+        points = {f"point {i}": f"{reason.text} {reason.action}" for i, reason in enumerate(verdict.reasons, 1)}
+        return {verdict.status.value: verdict.sentence, **points, **numbers, **place}
 
     @property
     def observer(self) -> Observer:

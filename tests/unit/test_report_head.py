@@ -239,7 +239,9 @@ def test_the_head_names_every_hidden_state_and_its_worst_condition(tmp_path: Pat
     assert "force (45.0 %" in judge(Facts(metrics(evaluation=rows, **conditions))).reasons[-1].text
     rows.append(row(NAME, None, unit="c", channel="velocity") | {"condition": "cold"})
     assert judge(Facts(metrics(evaluation=rows, **conditions))).status is Status.NOT_READY
-    assert any("cold: diverged" in line for line in lines_of(RunResult(tmp_path, metrics(evaluation=rows, **conditions))))
+    assert any(
+        "cold: diverged" in line for line in lines_of(RunResult(tmp_path, metrics(evaluation=rows, **conditions)))
+    )
 
 
 def test_a_channel_without_a_unit_has_numbers_alone() -> None:

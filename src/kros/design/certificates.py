@@ -219,7 +219,7 @@ def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) ->
         problem.require_sound()
         return problem, ""
     except SynthesisError as error:
-        log.warning("%s: there are no robust observers and no certificates: %s", models.name, error)
+        log.warning("%s: no robust observers and no certificates for the set of plants: %s", models.name, error)
         return None, str(error)
 
 
@@ -243,7 +243,7 @@ def certificate(task: DesignTask, design: Design) -> Record:
             require_useful(problem, observer, bound)
         return facts | {"worst_case_h2": bound}
     except SynthesisError as error:
-        log.warning("%s: no certificate, %s", task.name, error)
+        log.warning("%s: no certificate for the set of plants: %s", task.name, error)
         return facts | {"reason": str(error)}
 
 

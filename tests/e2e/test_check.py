@@ -108,6 +108,12 @@ def test_good_units_are_not_flagged_for_being_recorded_less(checked, tmp_path, e
     assert {r["status"] == "not enough data" for r in rows} == {episodes * samples < 2000}
 
 
+def test_a_score_that_decides_nothing_is_the_true_one(checked, tmp_path) -> None:
+    rows = checked(recordings(tmp_path / "bad", NEW, 2, 100, bad=True))
+    assert {(r["status"], r["outlier"]) for r in rows} == {("not enough data", False)}
+    assert any(r["score"] > r["threshold"] for r in rows)
+
+
 def test_bad_units_are_found(checked, run, tmp_path) -> None:
     data = recordings(tmp_path / "bad", NEW, 6, 400, bad=True)
     rows = checked(data)

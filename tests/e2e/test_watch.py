@@ -35,7 +35,7 @@ def test_recordings_under_kills_are_judged_once(tmp_path) -> None:
     assert sum(counts["verdicts"].values()) == 10
 
 
-def test_damaged_files_are_refused_and_the_watch_goes_on(kros, run, tmp_path) -> None:
+def test_damaged_files_are_refused_and_the_watch_goes_on(kros, run, tmp_path, caplog) -> None:
     new = tmp_path / "new"
     (new / "deeper").mkdir(parents=True)
     (new / "a_0.csv").write_text("nothing")
@@ -55,6 +55,10 @@ def test_damaged_files_are_refused_and_the_watch_goes_on(kros, run, tmp_path) ->
     (new / "a_0.csv").write_text(recording(8))
     assert kros("watch", new, run, "--every", 0.05, "--once").stdout.split()[1] == "a_0.csv:"
     assert len(results(tmp_path / "new-results")["a_0.csv"]) == 2  # another file of that name
+    (new / "notes.csv").write_text("of another kind")
+    result = kros("watch", new, run, "--every", 0.05, "--once")
+    assert result.stdout.startswith(f"refused    notes.csv: Reading {new} as csv: no file matches")
+    assert ".kros" not in result.output + caplog.text  # where it is read
     assert kros("watch", tmp_path / "none", run).exit_code == 2
     assert kros("watch", new, tmp_path).exit_code == 2
 

@@ -312,16 +312,17 @@ def csv_files(source: Path) -> dict[str, Path]:
 
 def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match[str]]]:
     """Yield the files that the mapping describes; the others are counted and named."""
-    others = []
+    others, matched = [], False
     for relative, path in csv_files(source).items():
         if mapping.exclude and re.search(mapping.exclude, relative):
             continue
         match = re.search(mapping.files, relative)
         if match:
+            matched = True
             yield path, match
         else:
             others.append(relative)
-    if others:
+    if others and matched:  # if none does, the error says so
         text = "%d files in %s do not match files = %r and are ignored: %s."
         log.warning(text, len(others), source, mapping.files, some(others))
 

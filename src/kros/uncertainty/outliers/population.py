@@ -160,8 +160,8 @@ class Recorded:
         """Return what can be said about a unit: nothing where it was recorded for too little."""
         if self.suffices(evidence):
             return score
-        score_db, more = min(score.score_db, score.threshold_db), OUTLIER.recorded * self.usual / evidence.n_samples
-        return replace(score, score_db=score_db, outlier=False, status=Status.NOT_ENOUGH_DATA, more_data=more)
+        more = OUTLIER.recorded * self.usual / evidence.n_samples
+        return replace(score, outlier=False, status=Status.NOT_ENOUGH_DATA, more_data=more)
 
 
 def _marks(factor: Factor, columns: slice = slice(None)) -> set[tuple[float, ...]]:

@@ -292,6 +292,25 @@ def test_one_clock_that_runs_back_hides_time_in_no_other_file(tmp_path: Path, ba
     assert [text.partition(":")[0] for text in found.findings] == [f"left out, a/{bad + 1}.csv"]
 
 
+def test_rows_that_repeat_are_dropped_and_stamps_that_repeat_need_a_period(tmp_path: Path):
+    """Every tenth row twice; then stamps of which one in two hundred is that of the sample before."""
+    doubled = {
+        name: [line for k, line in enumerate(lines) for _ in range(1 + (k % 10 == 7))]
+        for name, lines in recordings().items()
+    }
+    found = discover(written(tmp_path / "doubled", doubled))
+    assert (found.mapping["time"], found.prepare, found.findings) == ("time", (), ())
+    assert {len(found.population.read(key)) for key in found.population.episodes} == {120}
+    rounded = recordings(600)
+    for lines in rounded.values():
+        for k in (200, 400):
+            lines[k] = ",".join([lines[k - 1].partition(",")[0], lines[k].partition(",")[2]])
+    with pytest.raises(DataError, match=r"found 1\.97 s .* and 1\.97 s .*if stamps are rounded, .*--period 0\.01 or"):
+        discover(written(tmp_path / "rounded", rounded))
+    found = discover(tmp_path / "rounded", Wanted(period_s=0.01, measured=("angle",)))
+    assert len(found.population.episodes) == 6
+
+
 def test_a_wild_sample_is_reported(tmp_path: Path):
     rng = np.random.default_rng(0)
     for unit, condition, episode in [(u, c, e) for u in "ab" for c in ("hot", "cold") for e in (1, 2, 3)]:

@@ -140,10 +140,12 @@ def check_increasing(recording: Recording, where: str = "") -> None:
         return
     bad = np.flatnonzero(~(np.diff(time) > 0))
     if bad.size:
-        k = int(bad[0])
+        k, mean = int(bad[0]), (time[-1] - time[0]) / (len(time) - 1)
+        rounded = f"if stamps are rounded, give the period in their place, --period {mean:.3g} or sample_period_s"
         raise DataError(
-            f"{title(recording.key)}{where}: time should increase, found {time[k]:g} s at sample {k} and "
-            f"{time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps); sort samples by time, remove repeated ones."
+            f"{title(recording.key)}{where}: time should increase, found {time[k]:.9g} s at sample {k} and "
+            f"{time[k + 1]:.9g} s at sample {k + 1} ({len(bad)} such steps); "
+            f"{rounded if (np.diff(time) >= 0).all() else 'sort samples by time'}."
         )
 
 

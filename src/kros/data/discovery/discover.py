@@ -160,7 +160,9 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColum
         with suppress(DataError):
             values = table.numbers(places)
             if len(values) >= CHECK.samples:
-                samples[table] = np.where(usable(values), values, np.nan).T
+                known = np.where(usable(values), values, np.inf)
+                first = np.append(True, (known[1:] != known[:-1]).any(axis=1))  # the others repeat the row before
+                samples[table] = np.where(np.isfinite(known), known, np.nan)[first].T
     if not samples:
         tables[0].numbers(places)  # says why not, where it cannot be read
         problem = "the files have fewer than three rows of numbers; check the folder."

@@ -269,6 +269,18 @@ def test_an_episode_counts_up_to_a_gap_that_cannot_be_bridged(tmp_path: Path):
     assert found.findings == ("left out, motor2/run2.csv: it has 60 samples that can be used, and kros run needs 65",)
 
 
+def test_files_of_which_few_samples_are_used_are_named(tmp_path: Path):
+    files = recordings(800)
+    rows = files["motor2/run2.csv"]
+    rows[302:402] = [f"{line.partition(',')[0]},,," for line in rows[302:402]]
+    del files["motor1/run1.csv"][92:]
+    found = discover(written(tmp_path, files), fewest=65)
+    assert found.findings[:2] == (
+        "motor2/run2.csv: 400 samples are used, of 700, the rest is behind a gap",
+        "motor1/run1.csv: 90 samples are used, most have 800",
+    )
+
+
 def test_single_recordings_are_cut_into_as_many_episodes_as_they_hold(tmp_path: Path):
     files, names = recordings(900, [1]), Wanted(files=r"motor(?P<unit>\d)")
     assert discover(written(tmp_path, files), names, fewest=65).mapping["pieces"] == 4

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import kros
-from kros.identify.likeness import moments, unlike
+from kros.identify.likeness import apart, moments, unlike
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +34,28 @@ def test_another_sign_and_another_unit_of_measure_are_named(motors, name: str) -
     against, size = alerts(motors, {(one, name): -1.0, (other, name): np.pi / 180})
     assert against == f"Unit {one}: {name} moves against the other channels, unlike in most; check its sign."
     assert size.startswith(f"Unit {other}: {name} moves 0.01")
+
+
+def test_values_beyond_those_of_all_other_units_are_named() -> None:
+    """A temperature of five units, of one in degrees Fahrenheit; five units at temperatures of their own are as many."""
+    low, high = np.array([20.0, 22.0, 21.0, 23.0, 20.5]), np.array([60.0, 55.0, 58.0, 61.0, 59.0])
+    low[3], high[3] = 1.8 * low[3] + 32, 1.8 * high[3] + 32
+    ends = np.stack([low, high], axis=-1)[:, :, None]
+    (text,) = apart(["temperature"], dict(zip("abcde", ends, strict=True)))
+    values = "values between 73.4 and 141.8, those of other units between 20 and 60"
+    assert text == f"Unit d: temperature has {values}; check its column and unit of measure."
+    stairs = ends[:1] + 100 * np.arange(5)[:, None, None]
+    assert apart(["temperature"], dict(zip("abcde", stairs, strict=True))) == []
+
+
+def test_a_unit_whose_zero_is_another_is_named(motors) -> None:
+    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+    for values in data[motors.unit_ids[1]]:
+        values[:, 0] += 1e4
+    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
+    found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)
+    (alert,) = kros.identify(found, refine=False).facts.alerts
+    assert alert.startswith(f"Unit {motors.unit_ids[1]}: position has values between ")
 
 
 @pytest.mark.parametrize("name", ["position", "velocity", "current", "voltage"])

@@ -17,10 +17,10 @@ def moments(values: Array) -> Array:
 
 
 def course(values: Array) -> Array:
-    """Return three numbers of every channel of an episode (n_samples, c), shape (3, c).
+    """Return four numbers of every channel of an episode (n_samples, c), shape (4, c).
 
     They are the longest share of the episode in which it stays the same while another channel moves by half of its
-    span, its largest change from one sample to the next, and the range of 98 % of its samples.
+    span, its largest change from one sample to the next, and between which values 98 % of its samples are.
     """
     shares, far = np.zeros(values.shape[1]), np.ptp(values, axis=0) / 2
     for i, column in enumerate(values.T):
@@ -30,12 +30,13 @@ def course(values: Array) -> Array:
         if (np.ptp(part, axis=0) > far).any():
             shares[i] = len(part) / len(values)
     low, high = np.quantile(values, (0.01, 0.99), axis=0)
-    return np.array([shares, np.abs(np.diff(values, axis=0)).max(axis=0), high - low])
+    return np.array([shares, np.abs(np.diff(values, axis=0)).max(axis=0), low, high])
 
 
 def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> list[str]:
-    """Return a sentence for every state that stays the same, or jumps, unlike in most episodes, (episodes, 3, n)."""
-    shares, jumps, spans = np.swapaxes(courses, 0, 1)
+    """Return a sentence for every state that stays the same, or jumps, unlike in most episodes, (episodes, 4, n)."""
+    shares, jumps, low, high = np.swapaxes(courses, 0, 1)
+    spans = high - low
     held = (shares > CHECK.held) & (shares > CHECK.ratio * np.median(shares, axis=0))
     size = np.maximum(spans, np.median(spans, axis=0))
     found = [
@@ -44,6 +45,23 @@ def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> lis
     far = np.argwhere((jumps > CHECK.jump * size) & (size > 0))
     found += [(i, k, f"jumps by {jumps[i, k] / size[i, k]:.3g} times its range between two samples") for i, k in far]
     return [f"{episodes[i]}: {channels[k]} {what}; if its sensor failed, leave it out." for i, k, what in found]
+
+
+def apart(channels: Sequence[str], units: Mapping[str, Array]) -> list[str]:
+    """Return a sentence for every channel of a unit whose values are beyond those of all others, which are alike.
+
+    Units have the ends of their values, (2, c).
+    """
+    ends, found = np.array(list(units.values())), list[str]()
+    low, high = np.median(ends, axis=0)
+    among = (ends[:, 0] <= high) & (ends[:, 1] >= low)  # what most units have
+    for i, k in np.argwhere(~among & (2 * among.sum(axis=0) > len(ends)) & (high > low)):
+        (least, most), (lowest, highest) = ends[i, :, k], np.delete(ends, i, axis=0)[:, :, k].T
+        if least > highest.max() or most < lowest.min():
+            others = f"those of other units between {lowest.min():.4g} and {highest.max():.4g}"
+            text = f"values between {least:.4g} and {most:.4g}, {others}; check its column and unit of measure."
+            found.append(f"Unit {list(units)[i]}: {channels[k]} has {text}")
+    return found
 
 
 def unlike(channels: Sequence[str], units: Mapping[str, Mapping[str, Array]]) -> list[str]:

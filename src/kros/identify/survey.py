@@ -22,7 +22,7 @@ from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, scaling_
 from ..data.prepare import PreparedSource
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..data.recording import check_population, refuse_copies, some, title, usable, usable_episodes
-from .likeness import course, moments, odd, unlike
+from .likeness import apart, course, moments, odd, unlike
 
 log = logging.getLogger(__name__)
 UNLOADED = "noload"
@@ -89,7 +89,7 @@ class _EpisodeFacts:
     key: EpisodeKey
     digest: str
     n_samples: int
-    course: Array  # of the states, see `likeness`
+    course: Array  # see `likeness`
     moments: Array  # see `likeness`
 
 
@@ -186,7 +186,8 @@ def _facts(
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
     train, test = (tuple(k for s in splits.values() for k in getattr(s, name)) for name in _PARTS)
     digests, measured = {e.key: e.digest for e in episodes}, retained.measured
-    strange = odd([title(e.key) for e in episodes], retained.states, np.array([e.course for e in episodes]))
+    of_states = np.array([e.course for e in episodes])[..., : len(retained.states)]
+    strange = odd([title(e.key) for e in episodes], retained.states, of_states)
     return RecordingFacts(
         identify_on=condition_of(population.select(part), options.identify_on),
         groups=groups,
@@ -202,12 +203,19 @@ def _facts(
 
 def _unlike(population: Population, read: Sequence[_GroupFacts], units: Collection[str]) -> list[str]:
     """Return what is said about units whose recordings are unlike those of most, in any condition."""
-    by_condition: dict[str, dict[str, dict[str, Array]]] = {}
+    by_condition: dict[str, dict[str, list[_EpisodeFacts]]] = {}
     for group in read:
         if group.episodes and (key := group.episodes[0].key).unit in units:
-            by_condition.setdefault(key.condition, {})[key.unit] = {title(e.key): e.moments for e in group.episodes}
-    names, several = [c.name for c in population.channels], [of for of in by_condition.values() if len(of) > 2]
-    return list(dict.fromkeys(text for of in several for text in unlike(names, of)))
+            by_condition.setdefault(key.condition, {})[key.unit] = group.episodes
+    names, texts = [c.name for c in population.channels], list[str]()
+    for of in by_condition.values():
+        if len(of) > 2:
+            texts += unlike(names, {u: {title(e.key): e.moments for e in episodes} for u, episodes in of.items()})
+            ends = {u: np.array([e.course[2:] for e in episodes]) for u, episodes in of.items()}
+            named = tuple(f"{text.partition(' moves ')[0]} " for text in texts)
+            ends = {u: np.array([v[:, 0].min(axis=0), v[:, 1].max(axis=0)]) for u, v in ends.items()}
+            texts += [text for text in apart(names, ends) if not text.startswith(named)]
+    return list(dict.fromkeys(texts))
 
 
 def check_usable(
@@ -242,8 +250,8 @@ def _read_group(task: _Group) -> _GroupFacts:
         for key, values, digest in usable_episodes(population, task.on_nan):
             if not episodes:
                 resolution.update(_resolution(population, key, values))
-            of_states = course(values[:, : len(names)])[:, : len(population.states)]
-            episodes.append(_EpisodeFacts(key, digest, len(values), of_states, moments(values[:, : len(names)])))
+            recorded = values[:, : len(names)]
+            episodes.append(_EpisodeFacts(key, digest, len(values), course(recorded), moments(recorded)))
             yield key, values, digest
 
     if task.folder is None:

@@ -259,6 +259,10 @@ def _examined(source: Path, draft: Discovery, excluded: Sequence[str], fewest: i
         )
     files = _files_of(population, source)
     findings += [f"left out, {files[key]}: {why}" for key, why in wrong.items()]
+    usual = np.median([s.n_samples for s in good])
+    short = {s: f"of {s.n_samples + s.lost}, the rest is behind a gap" for s in good if s.lost}
+    short |= {s: f"most have {usual:.0f}" for s in good if CHECK.ratio * s.n_samples < usual}
+    findings += [f"{files[s.key]}: {s.n_samples} samples are used, {why}" for s, why in short.items()]
     few, shortest = [group for group, n in counts.items() if n < 2], min(s.n_samples for s in good)
     if 2 * len(few) > len(counts) and shortest >= 2 * fewest:
         mapping = mapping | {"pieces": int(np.clip(shortest // RULE.shortest_piece, 2, RULE.pieces))}

@@ -45,6 +45,7 @@ class EpisodeLook:
     key: EpisodeKey
     wrong: str = ""  # why it cannot be used, or nothing
     n_samples: int = 0  # that can be used, up to a gap that is too long to be bridged
+    lost: int = 0  # behind such gaps
     period_s: float = np.nan  # typical step of time
     uneven: tuple[float, int] = (0.0, 0)  # largest relative deviation of a step of time, and the sample before it
     nan: bool = False  # whether it holds NaN or infinity
@@ -85,8 +86,16 @@ def _look(population: Population) -> list[EpisodeLook]:
                 far = min(100, len(time) // 2)  # steps at once: single ones may be rounded
                 period = float(np.median(time[far:] - time[:-far])) / far
                 deviation = np.abs(np.diff(time) / period - 1)
-            start, stop = longest_stretch(np.asarray(recording.usable(period).time_s), GAP * period)
-            look = EpisodeLook(key, "", stop - start, period, (float(deviation.max()), int(deviation.argmax())))
+            usable_s = np.asarray(recording.usable(period).time_s)
+            start, stop = longest_stretch(usable_s, GAP * period)
+            look = EpisodeLook(
+                key,
+                "",
+                stop - start,
+                len(usable_s) - (stop - start),
+                period,
+                (float(deviation.max()), int(deviation.argmax())),
+            )
             check_episode(values, key, population.columns)
             looks[key] = replace(look, digest=digest_of(values))
             watch.add(key, values)

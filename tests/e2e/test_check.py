@@ -114,6 +114,16 @@ def test_a_score_that_decides_nothing_is_the_true_one(checked, tmp_path) -> None
     assert any(r["score"] > r["threshold"] for r in rows)
 
 
+def test_a_channel_of_a_new_unit_that_is_unlike_those_of_the_study_is_named(checked, tmp_path, caplog) -> None:
+    wrong = [episode(drive(100), 400, 100, e) * (1.0, 30.0, 1.0) for e in range(6)]
+    good = [episode(drive(101), 400, 101, e) for e in range(6)]
+    write_parquet(from_arrays({"n0": wrong, "n1": good}, CHANNELS, PERIOD_S), tmp_path / "new")
+    checked(tmp_path / "new")
+    (alert,) = (text for text in caplog.messages if "unit" in text.lower())
+    assert alert.startswith("Unit n0: velocity moves ")
+    assert alert.endswith("times as much as in most units; check its column and unit of measure.")
+
+
 def test_bad_units_are_found(checked, run, tmp_path) -> None:
     data = recordings(tmp_path / "bad", NEW, 6, 400, bad=True)
     rows = checked(data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def apart(channels: Sequence[str], units: Mapping[str, Array]) -> list[str]:
     return found
 
 
-def unlike(channels: Sequence[str], units: Mapping[str, Mapping[str, Array]]) -> list[str]:
+def unlike(channels: Sequence[str], units: Mapping[str, Mapping[Any, Array]]) -> list[str]:
     """Return a sentence for every channel of a unit whose size, or whose sign, is not that of most units.
 
     Units have the moments of their episodes, by the titles of these. If it is so in some episodes, these are named.

@@ -175,6 +175,8 @@ def score_condition(
             other = "the study has a unit of this name, with other recordings"
             same = "Give --same-unit if it is the same machine, which is then compared with the other units alone"
             raise DataError(f"Checking unit {unit} ({condition}): {other}. {same}; else rename it.")
+        for alert in recorded.unlike(unit, list(map(title, keys)), factor):
+            log.warning("%s", alert)
         known |= {unit} & set(recorded.units)
         (response,) = recorded.response([evidence])
         level = None if recorded.same_motions(factor) else motion

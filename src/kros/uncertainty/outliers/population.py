@@ -21,6 +21,7 @@ from ...core import AnyArray, Work, frozen
 from ...identify import Factor, ModelSet, combine
 from ...identify.factors import lifted_factor
 from ...identify.identified import EpisodeFactors, IdentifiedModels
+from ...identify.likeness import unlike
 from ..forms import evenly
 from ..settings import OUTLIER, QuantifySettings
 from .model import OutlierModel, score_outliers
@@ -141,10 +142,29 @@ class Recorded:
         one, other = ([e.part(range(k, len(e.factor.R), 2)) for e in several] for k in (0, 1))
         return (self.response(one), self.response(other)) if several else None
 
+    @property
+    def _inputs(self) -> slice:
+        """Columns of factors that are recorded inputs."""
+        first = self.models.lifting.n_states + len(self.models.lifting.separation.basis)
+        return slice(first, first + len(self.models.input_scale))
+
+    def unlike(self, unit: str, titles: Sequence[str], factor: Factor) -> list[str]:
+        """Return a sentence for every channel of a unit whose size or sign is not that of most units of the study."""
+        channels = [*self.models.lifting.states, *self.models.recorded_inputs]
+        units = {u: dict(enumerate(self._moments(e.factor))) for u, e in self.units.items()}
+        texts = unlike(channels, units | {unit: dict(zip(titles, self._moments(factor), strict=True))})
+        return [text for text in texts if text.startswith(tuple(f"{name}: " for name in (f"Unit {unit}", *titles)))]
+
+    def _moments(self, factor: Factor) -> AnyArray:
+        """Return second moments of channels, as `likeness.moments` of episodes of which no changes are known."""
+        n, inputs = self.models.lifting.n_states, self._inputs
+        R = np.concatenate([factor.R[..., :n], factor.R[..., inputs]], axis=-1)
+        moments = R.swapaxes(-1, -2) @ R / factor.n_samples[:, None, None]
+        return np.pad(moments, ((0, 0), *2 * [(0, R.shape[-1])]))
+
     def same_motions(self, factor: Factor) -> bool:
         """Tell whether a unit was moved by inputs of the study alone."""
-        first = self.models.lifting.n_states + len(self.models.lifting.separation.basis)
-        inputs = slice(first, first + len(self.models.input_scale))
+        inputs = self._inputs
         return _marks(factor, inputs) <= set().union(*(_marks(e.factor, inputs) for e in self.units.values()))
 
     def same_recordings(self, factor: Factor) -> set[str]:

@@ -63,6 +63,21 @@ def test_damaged_files_are_refused_and_the_watch_goes_on(kros, run, tmp_path, ca
     assert kros("watch", new, tmp_path).exit_code == 2
 
 
+def test_the_files_of_a_unit_are_judged_together(kros, run, tmp_path) -> None:
+    new = tmp_path / "new"
+    new.mkdir()
+    for episode in range(3):
+        (new / f"n01_{episode}.csv").write_text(recording(episode))
+    (new / "n02_0.csv").write_text(recording(7))
+    (new / "n01_3.csv").write_text(recording(1))
+    kros("watch", new, run, "--every", 0.05, "--once")
+    found = {name: of for name, (of,) in results(tmp_path / "new-results").items()}
+    episodes = {name: [row["episodes"] for row in of["rows"]] for name, of in found.items()}
+    assert episodes == {"n01_0.csv": [1], "n01_1.csv": [2], "n01_2.csv": [3], "n01_3.csv": [], "n02_0.csv": [1]}
+    assert found["n01_3.csv"]["verdict"] == "refused"
+    assert "is a copy of episode 1 of unit n01" in found["n01_3.csv"]["reason"]
+
+
 def test_a_name_in_another_encoding_is_refused(run, tmp_path) -> None:
     new = tmp_path / "new"
     new.mkdir()

@@ -74,6 +74,10 @@ def test_a_filter_bank_of_two_sensors_of_which_one_or_both_are_lost(tmp_path):
     found, bits = compiled.run(y, u)
     np.testing.assert_array_equal(bits, status)
     assert apart(found, wanted) < 1e-9
+    size = '#include <stdio.h>\n#include "drive.h"\nint main(void) { return (int)(sizeof(drive_state) / 8) != %d; }'
+    (tmp_path / "c" / "size.c").write_text(size % (compiled.state_bytes // 8))
+    subprocess.run(["cc", "size.c", "-o", "size"], cwd=tmp_path / "c", check=True)
+    subprocess.run(["./size"], cwd=tmp_path / "c", check=True)
     begun = y[10:], u[10:]  # by the compiled loop, too
     batch = run_observer(observer, *(np.repeat(each[:, None], 3, axis=1) for each in begun))
     assert apart(batch[1:, 2], in_python(observer, *begun)[0][:-1]) < 1e-9

@@ -49,7 +49,7 @@ class IdentifySettings(Settings):
     population is finite; the factor is doubled until the peak residual around the best nominal unit is at most one
     half, where that can be reached. `refine` replaces these models by ones that are refined on their free-run error,
     the population first, then each unit, held near the population's model by a prior. Its strength is chosen on
-    episodes that the fit leaves out.
+    left-out episodes.
     """
 
     alpha: Annotated[float, Field(ge=0)] | Literal["auto"] = Field(

@@ -144,7 +144,7 @@ def _state_bytes(source: Source) -> int:
     doubles = m + (1 + m + len(source.shift_others) if source.shift else 0)
     reals = n + order + len(o.lifting.window.earlier) + len(o.lifting.parameters) + o.runtime.delay * m
     reals += n + order + 2 if source.loop else 0
-    reals += len(o.recorded) + q * (o.bank.filters + 1) + 1 if o.bank else 0
+    reals += o.bank.half.size + q * (o.bank.filters + 1) + 1 if o.bank else 0
     reals += q * len(o.monitor.filters) * 3 + 1 if o.monitor else 0
     words = m + bool(o.runtime.delay) + bool(o.monitor) + 2
     align = 8 if doubles or real == 8 else 4

@@ -144,9 +144,9 @@ class Recorded:
 
     @property
     def _inputs(self) -> slice:
-        """Columns of factors that are recorded inputs."""
+        """Columns of factors that are recorded inputs; functions of inputs are behind them."""
         first = self.models.lifting.n_states + len(self.models.lifting.separation.basis)
-        return slice(first, first + len(self.models.input_scale))
+        return slice(first, first + len(self.models.recorded_inputs))
 
     def unlike(self, unit: str, titles: Sequence[str], factor: Factor) -> list[str]:
         """Return a sentence for every channel of a unit whose size or sign is not that of most units of the study."""

@@ -10,7 +10,7 @@ import pytest
 from residuals import of_function
 from scipy.linalg import expm
 
-from kros.core import DataError, StateSpace
+from kros.core import StateSpace
 from kros.uncertainty import quantify
 from kros.uncertainty.weights.cover import NEPER_DB
 from kros.uncertainty.weights.fit import fit_weight
@@ -152,13 +152,6 @@ def test_identical_units_and_single_frequencies_get_weights() -> None:
     pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
     for freqs in ([0.1], [0.0, 0.5], [0.5]):
         assert quantify(pair, "additive", freqs, max_order=2).cover_max <= 1
-
-
-def test_units_that_are_alike_only_at_the_frequencies_given_are_refused() -> None:
-    """`(z - 1) / (z - p)` is zero at DC, whatever p."""
-    units = [StateSpace([[p]], [[1.0]], [[p - 1]], [[1.0]], 1.0) for p in (0.5, 0.6, 0.75)]
-    with pytest.raises(DataError, match="differ elsewhere"):
-        quantify(units, "additive", [0.0])
 
 
 def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:

@@ -131,11 +131,9 @@ class ObserverData:
         require_measured(self.sensor, self.outputs)
         if self.bank is not None:
             bank, recorded = self.bank, (len(self.recorded),)
-            shapes, ages = (
-                (getattr(bank, name).shape for name in ("start", "half", "recovery", "reach")),
-                (min(2, q), *recorded),
-            )
-            self._require("start, half, recovery and reach", tuple(shapes), ((n, rows + columns), ages, ages, recorded))
+            ages = (min(2, q), *recorded)  # of gaps of all measurements and, of several, of some
+            shapes = bank.start.shape, bank.half.shape, bank.recovery.shape, bank.reach.shape
+            self._require("start, half, recovery and reach", shapes, ((n, rows + columns), ages, ages, recorded))
             self._require("start_recovery", bank.start_recovery.shape, (1,))
             if not 0 <= bank.filters <= (most := n - 4 * recorded[0]):
                 raise DimensionError(

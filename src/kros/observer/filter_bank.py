@@ -70,6 +70,7 @@ def longest_age(half: Array) -> Array:
 
 
 OLDEST = float(longest_age(np.ones(1))[0])  # age of a start
+_WAITING = 2 * OLDEST  # stands for it until a sample has all measurements
 
 
 class Gaps:
@@ -101,7 +102,7 @@ class Gaps:
     def begin(self, rows: Any, missing: Flags) -> None:
         """Start some machines at measurements of which some may be missing."""
         self.state[:, rows] = 0.0
-        self.start[rows] = OLDEST * np.where(missing.any(axis=1, keepdims=True), 2.0, 1.0)[rows]
+        self.start[rows] = np.where(missing.any(axis=1, keepdims=True), _WAITING, OLDEST)[rows]
 
     @property
     def waiting(self) -> Flags:
@@ -162,7 +163,8 @@ class Gaps:
     def job(self) -> Record:
         """What the compiled loop needs of gaps."""
         bank = self.bank
-        rows = np.vstack([bank.half, bank.recovery, longest_age(bank.half), bank.start_recovery + 0.0 * bank.half[:1]])
+        start = np.full_like(bank.half[:1], bank.start_recovery[0])
+        rows = np.vstack([bank.half, bank.recovery, longest_age(bank.half), start])
         return {
             "recorded": self.recorded,
             "kinds": len(bank.half),

@@ -63,10 +63,8 @@ class RunningObserver:
 
     def __init__(self, observer: ObserverData, y: ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
-        self._screen, self._course = (
-            Screen.of(observer),
-            Course(observer, 1, parameters, watch=Watch.of(observer.monitor)),
-        )
+        self._screen = Screen.of(observer)
+        self._course = Course(observer, 1, parameters, watch=Watch.of(observer.monitor))
         self.parameters = parameters
         self.reset(y)
 

@@ -123,14 +123,14 @@ class Screen:
     most: Array
     q: int
     longest: int = LONGEST
-    alone: bool = False  # whether an observer starts without measurements, too, as filter banks do
+    inputs_only: bool = False  # whether inputs are enough to start at, as for filter banks
 
     @classmethod
     def of(cls, observer: ObserverData) -> Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
         sides = (side[list(observer.measured)] for side in observer.runtime.sides(observer.lifting.n_states))
         screen = cls.sized(observer.seen, len(observer.measured), len(observer.inputs), *sides)
-        return screen if observer.bank is None else replace(screen, longest=NEVER - 1, alone=True)
+        return screen if observer.bank is None else replace(screen, longest=NEVER - 1, inputs_only=True)
 
     @classmethod
     def sized(
@@ -148,7 +148,7 @@ class Screen:
 
     def enough(self, known: Flags) -> Flags:
         """Return whether measurements that are known, (..., q), are enough to start at."""
-        return np.asarray(known.any(axis=-1) | self.alone)
+        return np.asarray(known.any(axis=-1) | self.inputs_only)
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m); `held` is known before the first."""

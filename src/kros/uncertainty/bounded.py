@@ -95,8 +95,6 @@ def bound_responses(
     responses: AnyArray, form: Form, freqs_hz: ArrayLike | None, options: Options
 ) -> ResponseUncertainty:
     """Return the set of frequency responses, shape (unit, frequency, p, m)."""
-    from scipy.signal import find_peaks
-
     dt, ids = options.sample_period_s, options.ids(len(responses))
     if freqs_hz is None or dt is None:
         raise ConfigError("Quantify: responses need their frequencies, freqs_hz in Hz, and sample_period_s in seconds.")
@@ -108,9 +106,9 @@ def bound_responses(
     fields |= {"output_scale": scales[0], "input_scale": scales[1], "sample_period_s": float(dt)}
     bound = fields["bounds"][form]
     text = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
-    tops = find_peaks(bound, SET.exact * bound.max())[0]
-    low = np.minimum(bound[tops - 1], bound[tops + 1])
-    unresolved = freqs[tops[bound[tops] > SET.resolved * low]]
+    middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
+    top = (middle >= bound[:-2]) & (middle >= bound[2:])
+    unresolved = freqs[1:-1][top & (middle > np.maximum(SET.resolved * low, SET.exact * bound.max()))]
     if unresolved.size:
         some = ", ".join(f"{f:.4g}" for f in unresolved[:5])
         text += f"; they do not resolve {unresolved.size} peaks of the residuals, at {some} Hz"

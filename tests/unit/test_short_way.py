@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -143,23 +142,6 @@ def test_units_that_were_not_recorded_where_it_counts_are_named(
     found = kros.identify(kros.from_arrays(data, **names, sample_period_s=population.sample_period_s), refine=False)
     assert len(found.models().unit_ids) == 2
     assert f"Units {', '.join(population.unit_ids[2:])} were not recorded in condition 'cold'" in caplog.text
-
-
-def test_a_run_takes_models_that_are_identified(
-    population: Population, uncertain: UncertainModels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tables = {"until": "quantify", "uncertainty": {"n_freqs": 60}}
-    alone = kros.run(population, tmp_path / "alone", identify={"refine": False}, **tables)
-    with monkeypatch.context() as patch:
-        patch.setattr("kros.study.stages.learning.with_models", None)
-        found = kros.run(population, tmp_path / "run", models=uncertain.models, **tables)
-    assert found.metrics["uncertainty"] == alone.metrics["uncertainty"]
-    again = kros.run(population, tmp_path / "run", models=uncertain.models, **tables)
-    assert again.metrics["models"] == found.metrics["models"] == alone.metrics["models"]
-    with pytest.raises(ConfigError, match="without their recordings"):
-        kros.run(tmp_path, tmp_path / "other", models=uncertain.models)
-    with pytest.raises(ConfigError, match="from other episodes"):
-        kros.run(population, tmp_path / "other", models=uncertain.models, split={"test": ["0"]}, until="identify")
 
 
 def test_episodes_with_gaps_can_be_dropped(population: Population, tmp_path) -> None:  # type: ignore[no-untyped-def]

@@ -9,7 +9,6 @@ from typing import Any
 
 from ..core import ByName, ConfigError, Executor, Progress, Record, Work, member, write_json
 from ..data import OUTLIERS, Population, Shown, detect_reader
-from ..identify import IdentifiedModels
 from ..identify.presets import resolve_lifting, resolve_phase
 from ..identify.survey import check_usable
 from ..observer import Observer, require_measured
@@ -91,7 +90,6 @@ def run(
     source: Population | StudyConfig | Path | str,
     out: Path | str,
     *,
-    models: IdentifiedModels | None = None,
     until: Stage | str = Stage.REPORT,
     workers: int = 1,
     scheduler: str | None = None,
@@ -107,9 +105,6 @@ def run(
         `load_config` returns.
     out : Path or str
         Run folder; a stage whose result is there is skipped.
-    models : IdentifiedModels, optional
-        Of a population, as `kros.identify` returned them: they are not identified again. Where units are left out,
-        models of the others are identified as the study's tables say.
     until : Stage or str
         Last stage to run.
     workers : int
@@ -145,12 +140,10 @@ def run(
     until, given = member(Stage, until, "--until"), source if isinstance(source, Population) else None
     out = Path(out) if scheduler is None else Path(out).absolute()  # workers elsewhere have another current folder
     config = study_of(source, out, sections)
-    if models is not None and given is None:
-        raise ConfigError("Run: models are given without their recordings; give the population that they are of.")
     require_own(out, config)
     require_usable(config, until, given)
     with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
-        return run_in(store, config, until, executor, progress, given, models)
+        return run_in(store, config, until, executor, progress, given)
 
 
 def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: ByName) -> StudyConfig:
@@ -199,10 +192,9 @@ def run_in(
     executor: Executor,
     progress: Progress | None = None,
     given: Population | None = None,
-    models: IdentifiedModels | None = None,
 ) -> RunResult:
     """Run a study in its run folder, which is open."""
-    context = Context(config, store, Work(executor, progress or Progress()), given, models)
+    context = Context(config, store, Work(executor, progress or Progress()), given)
     run_steps(context, STEPS, until)
     metrics = collect_metrics(context, until)
     write_json(store.path(METRICS), metrics)

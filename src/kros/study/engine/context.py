@@ -28,13 +28,12 @@ from .store import DEPLOYED, METRICS, STUDY, Store, code_key, load_run
 
 @frozen
 class Context:
-    """What a stage gets: the study, its run folder, where work runs, and recordings and models that are given."""
+    """What a stage gets: the study, its run folder, where work runs, and recordings that are given."""
 
     config: StudyConfig
     store: Store
     work: Work
     given: Population | None = None
-    models: IdentifiedModels | None = None
 
     @cached_property
     def facts(self) -> RecordingFacts:
@@ -49,15 +48,11 @@ class Context:
     @cached_property
     def lifting(self) -> Lifting:
         """The Koopman lifting of the study; without functions where none is declared and none suits the plant."""
-        if self.models is not None:
-            return self.models.lifting
         return resolve_lifting(self.config.lifting, self.config.calibrate, self.population, self.config.split.test)
 
     @cached_property
     def phase_spec(self) -> PhaseSpec | None:
         """What is calibrated, if anything."""
-        if self.models is not None:
-            return None if self.models.calibration is None else self.models.calibration.spec
         return resolve_phase(self.config.calibrate, self.population, self.lifting)
 
     @cached_property
@@ -161,10 +156,9 @@ def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, s
     """Return digests of what stages follow from: kros, the stages before, recordings, their part of the study."""
     tables, digest, digests = context.config.dump(), code_key(), dict[Stage, str]()
     tables |= {f"{section}.{key}": v for section, of in tables.items() if isinstance(of, dict) for key, v in of.items()}
-    digest_inputs = {Stage.READ: inputs_digest, Stage.CALIBRATE: models_digest}
     for step in steps:
         if step.wanted(context.config):
-            inputs = digest_inputs[step.stage](context) if step.stage in digest_inputs else ""
+            inputs = inputs_digest(context) if step.stage is Stage.READ else ""
             digest = digest_of(digest, str(step.stage), inputs, [tables[name] for name in step.sections])
             digests[step.stage] = digest
     return digests
@@ -178,13 +172,6 @@ def inputs_digest(context: Context) -> str:
         return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
     files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
     return digest_of([(str(f), *stamp_of(f)) for f in files])
-
-
-def models_digest(context: Context) -> str:
-    """Return a digest of models that are given."""
-    if (given := context.models) is None:
-        return ""
-    return digest_of([(m.A.tobytes(), m.B.tobytes()) for m in given.sets.values()], given.parameters, given.lifting)
 
 
 def _digest(given: Population, key: EpisodeKey) -> str:

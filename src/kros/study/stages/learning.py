@@ -79,20 +79,15 @@ def run_read(context: Context) -> None:
 
 def run_calibrate(context: Context) -> None:
     """Calibrate the phase of every unit, where the lifting has one."""
-    known, spec = context.models and context.models.calibration, context.phase_spec
-    if spec is not None:
-        calibration = known or calibrate(context.population, context.facts, spec, context.work)
+    if (spec := context.phase_spec) is not None:
+        calibration = calibrate(context.population, context.facts, spec, context.work)
         calibration.save(context.store.draft("calibration"))
 
 
 def run_identify(context: Context) -> None:
-    """Identify models of every kind in every condition, or take those that are given."""
-    given, facts = context.models, context.facts
-    if given is not None and (given.facts.train, given.facts.digests) != (facts.train, facts.digests):
-        raise ConfigError("Run: models were identified from other episodes; identify those of the study, split alike.")
-    base = IdentifiedModels(context.population, facts, context.lifting, context.calibration)
-    models = given or with_models(base, context.config.identify, context.work)
-    models.save_models(context.store.draft())
+    """Identify models of every kind in every condition."""
+    base = IdentifiedModels(context.population, context.facts, context.lifting, context.calibration)
+    with_models(base, context.config.identify, context.work).save_models(context.store.draft())
 
 
 def run_quantify(context: Context) -> None:

@@ -13,8 +13,6 @@ from kros.data import Population
 from kros.evaluate import fit_percent
 from kros.identify.identified import IdentifiedModels
 from kros.interop import to_control
-from kros.report.canvas import thin
-from kros.report.theme import DRAWING
 
 PERIOD = 0.01
 
@@ -40,7 +38,7 @@ def test_the_fit_is_that_of_the_simulation(models: IdentifiedModels) -> None:
     assert np.isnan(fit_percent(estimate, np.ones((3, 1)))[0])
     figure = models.plot("compare", unit=models.models().unit_ids[1])
     simulated, measured = (line.get_ydata() for line in figure.axes[4].lines[::-1])
-    percent = fit_percent(simulated[:, None], measured[:, None])[0]  # of a line of all samples: the episode is short
+    percent = fit_percent(simulated[:, None], measured[:, None])[0]
     assert figure.axes[5].get_title(loc="left") == f"fit {percent:.1f} %"
     with pytest.raises(ConfigError, match="unit 'x' has no episode in condition 'default'"):
         models.plot("compare", unit="x")
@@ -67,11 +65,3 @@ def test_summaries_are_short_and_escaped_in_html(models: IdentifiedModels) -> No
         assert lines[0] == type(shown).__name__
         assert 5 <= len(lines) <= 16
     assert design.observer.plot(models=models).axes[4].lines[1].get_label() == "linear (EDMD), tuned Kalman"
-
-
-def test_a_thinned_line_ends_with_its_last_samples() -> None:
-    time = np.arange(899.0)
-    x, y = thin(time, np.sin(time))
-    assert np.diff(x).max() < 2 * np.ceil(899 / DRAWING.points)
-    assert (x[-1], len(x) <= 2 * DRAWING.points + 1) == (898.0, True)
-    assert y[-1] == np.sin(898.0)

@@ -1,4 +1,4 @@
-"""Blank figures and what is drawn on many of them: thinned lines, labels at line ends, legends, axes in decibels."""
+"""Blank figures and what is drawn on many of them: labels at line ends, legends, axes in decibels."""
 
 from __future__ import annotations
 
@@ -46,18 +46,6 @@ def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, fl
     """Write a small text at a place in shares of the axes, moved by an offset in points."""
     settings: Record = {"xycoords": "axes fraction", "size": "small"} | options
     axes.annotate(text, at, xytext=offset, textcoords="offset points", **settings)
-
-
-def thin(x: AnyArray, y: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Return a line with fewer points that looks the same: smallest and largest value of every bucket, in order."""
-    size = -(-len(y) // DRAWING.points)
-    if size < 3:
-        return x, y
-    values = np.pad(np.where(np.isfinite(y), y, 0.0), (0, -len(y) % size), mode="edge")
-    blocks = values.reshape(-1, size)
-    starts = np.arange(len(blocks)) * size
-    rows = np.unique(np.concatenate([starts + blocks.argmin(axis=1), starts + blocks.argmax(axis=1), [len(y) - 1]]))
-    return x[rows], y[rows]
 
 
 def decibel(values: ArrayLike) -> AnyArray:

@@ -25,7 +25,6 @@ class Drawing:
     broad: float = 2.8  # points that a line is wide which others are compared with
     shade: float = 0.35  # opacity of what lies behind
     dots_per_inch: int = 200
-    points: int = 250  # buckets of a line over time, frequencies of residuals
     frequencies: int = 140  # of a frequency response
     decades: int = 5  # below half of the sampling frequency
     states: int = 4  # rows of one episode or plant

@@ -16,7 +16,7 @@ from ...evaluate.held_out import HeldOut
 from ...evaluate.sensor import as_shown
 from ...identify import IdentifiedModels
 from ...observer import run_observer
-from ..canvas import Axes, Captioned, Figure, frequency_axis, grid, label_below, legend, logarithmic, set_titles, thin
+from ..canvas import Axes, Captioned, Figure, frequency_axis, grid, label_below, legend, logarithmic, set_titles
 from ..names import (
     Look,
     condition_label,
@@ -31,7 +31,6 @@ from ..names import (
     observer_pair,
     published,
     readable_unit,
-    shorten,
     squared,
     words,
 )
@@ -167,8 +166,7 @@ def _inside(values: AnyArray, recorded: AnyArray) -> AnyArray:
 
 def draw_line(axes: Axes, time_s: AnyArray, values: AnyArray, look: Look, label: str | None = None) -> None:
     """Draw a line over time, in front of earlier ones."""
-    x, y = thin(time_s, values)
-    axes.plot(x, y, look.style, color=look.colour, alpha=look.opacity, label=label, lw=look.weight)
+    axes.plot(time_s, values, look.style, color=look.colour, alpha=look.opacity, label=label, lw=look.weight)
     axes.set_xlim(time_s[0], time_s[-1])
 
 
@@ -176,10 +174,9 @@ def label_rows(axes: Iterable[Axes], channels: Sequence[Channel]) -> None:
     """Label the vertical axes with channel and unit of measure."""
     for row, channel in zip(axes, channels, strict=True):
         row.locator_params(axis="y", nbins=4)
-        wrapped = textwrap.wrap(words(channel.name), DRAWING.label, break_long_words=False)
-        lines = [shorten(line, DRAWING.label) for line in wrapped[:2]]
+        lines = textwrap.wrap(words(channel.name), DRAWING.label, max_lines=2, placeholder="…")
         unit = readable_unit(channel.unit)
-        row.set_ylabel("\n".join([*lines, *([f"({unit})"] if unit else [])]))
+        row.set_ylabel("\n".join([*lines, f"({unit})" if unit else ""]).strip())
 
 
 def references(channels: Sequence[Channel]) -> dict[str, int]:

@@ -96,7 +96,7 @@ class RunFolder:
     @cached_property
     def models(self) -> dict[str, ModelSet]:
         """Models of the condition that feeds synthesis, of EDMD too where they are the start of refined ones."""
-        return self._at_home("models/([^/]+)/model.json", ModelSet.load, "no models have been identified yet")
+        return self._load("models/([^/@]+)/model.json", ModelSet.load, "no models have been identified yet")
 
     @property
     def kinds(self) -> Names:
@@ -107,21 +107,20 @@ class RunFolder:
     def uncertain(self) -> dict[str, UncertainModel]:
         """Uncertain models of the condition that feeds synthesis."""
         reason = "the uncertainty has not been quantified yet"
-        return self._at_home("uncertainty/([^/]+)/[^/]+.json", UncertainModel.load, reason)
+        return self._load("uncertainty/([^/@]+)/[^/]+.json", UncertainModel.load, reason)
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
         """Residuals of all units relative to the weights, by kind of model."""
-        return self._at_home(
-            "uncertainty/([^/]+)/units/[^/]+.json", UnitResiduals.load, "there are no residuals of single units"
-        )
+        reason = "there are no residuals of single units"
+        return self._load("uncertainty/([^/@]+)/units/[^/]+.json", UnitResiduals.load, reason)
 
     @cached_property
     def others(self) -> dict[str, UnitResiduals]:
         """Residuals of the highest-scoring unit and of all others in its condition, by kind of model."""
         reason = "no unit was compared with the others; at least three units in a condition are needed"
         residuals = self._load("outliers/([^/]+)/others/[^/]+.json", UnitResiduals.load, reason)
-        return linear_first({name.partition("@")[0]: one for name, one in residuals.items()})
+        return {name.partition("@")[0]: one for name, one in residuals.items()}
 
     @cached_property
     def outlier_models(self) -> dict[str, OutlierModel]:
@@ -146,19 +145,15 @@ class RunFolder:
         return self._record("observers/observers.json").get("deployed")
 
     @cached_property
-    def evaluation(self) -> Record:
-        """Errors of all observers and models."""
-        return self._evaluation[0]
-
-    @cached_property
-    def _evaluation(self) -> tuple[Record, dict[str, AnyArray]]:
+    def evaluation(self) -> tuple[Record, dict[str, AnyArray]]:
+        """Errors of all observers and models, and the signals that are shown."""
         reason = "the observers have not been evaluated yet"
         return load_artifact(self._require("evaluation/evaluation.json", reason), "evaluation")
 
     @cached_property
     def shown(self) -> list[Shown]:
         """Episodes with estimates: nominal unit, worst off-nominal unit, and the nominal unit in other conditions."""
-        content, arrays = self._evaluation
+        content, arrays = self.evaluation
 
         def below(start: str) -> dict[str, AnyArray]:
             return {n.removeprefix(start): values for n, values in arrays.items() if n.startswith(start)}
@@ -176,16 +171,11 @@ class RunFolder:
         return load_artifact(path.parent, path.stem)[0] if self.has(name) else {}
 
     def _load(self, pattern: str, load: Callable[[Path], T], reason: str) -> dict[str, T]:
-        """Load the folders of all files that match a regular expression, by what its group stands for."""
+        """Load the folders of all files that match a regular expression, by its group, those of linear models first."""
         matches = [match for name in sorted(self.files) if (match := re.fullmatch(pattern, name))]
         if not matches:
             raise NotShownError(reason)
-        return {match[1]: load((self.folder / match[0]).parent) for match in matches}
-
-    def _at_home(self, pattern: str, load: Callable[[Path], T], reason: str) -> dict[str, T]:
-        """Load by kind of model what belongs to the condition that feeds synthesis."""
-        of_conditions = self._load(pattern, load, reason)
-        return linear_first({name: one for name, one in of_conditions.items() if "@" not in name})
+        return linear_first({match[1]: load((self.folder / match[0]).parent) for match in matches})
 
     def _require(self, name: str, reason: str) -> Path:
         """Return the folder of a file, or raise with the reason why it is not there."""

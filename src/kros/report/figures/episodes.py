@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,7 @@ def free_run(run: RunFolder) -> Captioned:
     if not shown.models:
         raise NotShownError("no model was simulated on the episode that is shown")
     lines = {model_label(n): (values, model_look(n)) for n, values in shown.models.items()}
-    block = Block(episode_title(shown.key), shown, lines, range(len(run.states))[: DRAWING.states])
+    block = Block(episode_title(shown.key), shown, lines, range(len(run.states)))
     text = "Simulation from the first recorded state with the recorded inputs, without measurements."
     return _figure(run, [block], text)
 
@@ -66,18 +67,16 @@ def free_run(run: RunFolder) -> Captioned:
 def estimates(run: RunFolder, paper: bool = False) -> Captioned:
     """Draw estimates for the nominal and the worst off-nominal unit (the paper's Figures 11 and 12)."""
     shown = [s for s in run.shown if s.key.condition == run.facts.identify_on][:2]
-    if not shown or not shown[0].observers:
-        raise NotShownError("no observer was run on the episodes that are shown")
-    known = shown[0].observers
+    known, states = shown[0].observers, range(len(run.states)) if paper else run.hidden
     names = observer_pair(published(known)) if paper else observer_pair(known, run.deployed)
     if not names:
-        raise NotShownError("the paper's observers are designed with identify.refine = false alone")
-    states = (range(len(run.states)) if paper else run.hidden)[: DRAWING.states]
+        reason = "the paper's observers are designed with identify.refine = false alone"
+        raise NotShownError(reason if paper else "no observer was run on the episodes that are shown")
     blocks = [
         _observed(f"{role}: unit {one.key.unit}, episode {one.key.episode}", one, names, states)
         for role, one in zip(("nominal", "worst off-nominal"), shown, strict=False)
     ]
-    measured = " and ".join(words(c.name) for c in run.states if c.measured)
+    measured = joined([words(c.name) for c in run.states if c.measured])
     text = f"{_PAPER if paper else ''}Estimated from {measured} and inputs; errors are recorded minus estimated values."
     return _figure(run, blocks, text)
 
@@ -89,7 +88,7 @@ def other_condition(run: RunFolder) -> Captioned:
         raise NotShownError("the recordings have one condition only")
     pair = observer_pair(published(shown.observers))
     names = pair or observer_pair(shown.observers, run.deployed)
-    block = _observed(episode_title(shown.key), shown, names, range(len(run.states))[: DRAWING.states])
+    block = _observed(episode_title(shown.key), shown, names, range(len(run.states)))
     text = _PAPER if pair else ""
     text += f"Designed in “{condition_label(run.facts.identify_on)}” alone; errors are recorded minus estimated values."
     return _figure(run, [block], text)
@@ -107,7 +106,8 @@ def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[i
 
 def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> Captioned:
     """Return the figure of some episodes of a run and its caption; enlarged are some turns of the gearbox, or less."""
-    band_hz, samples = run.evaluation.get("band_hz"), len(run.shown[0].states)
+    blocks = [replace(block, states=block.states[: DRAWING.states]) for block in blocks]
+    band_hz, samples = run.evaluation[0]["band_hz"], len(run.shown[0].states)
     size = DRAWING.zoom if run.has("calibration/calibration.json") else samples // 8
     text += " Shaded: the band around the gearbox frequency at top speed." if band_hz else ""
     return blocks_figure(run.channels, blocks, size, band_hz), text

@@ -11,7 +11,7 @@ from ...design.task import split_name
 from ...identify import ModelSet
 from ...synthesis.result import Injection, Synthesis
 from ..canvas import Captioned, decibel, frequency_axis, grid, legend
-from ..names import label_of, linear_first, method_look, model_label
+from ..names import label_of, method_look, model_label
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone
 
@@ -20,11 +20,10 @@ Curve = tuple[str, AnyArray, str, str]
 
 def bode(run: RunFolder) -> Captioned:
     """Draw largest singular values of plant, weights and filters, linear beside Koopman (the paper's Figure 10)."""
-    designed = [n for n in run.syntheses if not label_of(n).baseline]
-    robust = [n for n in designed if split_name(n)[1] != "estimator"]  # which corrects no model
+    robust = [n for n in run.syntheses if not label_of(n).baseline and split_name(n)[1] != "estimator"]
     if not robust:
         raise NotShownError("no robust observer has been synthesized")
-    chosen = linear_first(grouped(robust, lambda name: split_name(name)[0]))
+    chosen = grouped(robust, lambda name: split_name(name)[0])
     figure, axes = grid(1, len(chosen), sharey=True)
     for panel, (name, observers) in zip(axes[0], chosen.items(), strict=True):
         freqs = run.models[name].frequencies(DRAWING.frequencies, decades=DRAWING.decades)

@@ -12,18 +12,7 @@ from ...uncertainty import Form, UncertainModel, residual, sigma_max
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.unit_residuals import UnitResiduals
 from ...uncertainty.weights.cover import Cover
-from ..canvas import (
-    Axes,
-    Captioned,
-    Figure,
-    decibel,
-    frequency_axis,
-    grid,
-    legend,
-    lines_of_units,
-    note,
-    set_titles,
-)
+from ..canvas import Axes, Captioned, Figure, decibel, frequency_axis, grid, legend, lines_of_units, note, set_titles
 from ..names import model_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, HUES, Tone
@@ -43,20 +32,19 @@ _PUBLISHED = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  #
 def forms(run: RunFolder) -> Captioned:
     """Draw the largest residuals in all forms, linear beside Koopman (the paper's Figure 7)."""
     chosen = run.uncertain
-    tall = {n: m for n, m in chosen.items() if len(m.output_scale) > len(m.input_scale)}
-    published = {n: published_bounds(m, run.models[n]) for n, m in tall.items()}  # these contain the identity
     used = words(next(iter(chosen.values())).form.value)
-    text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
-    text += " Dashed: the output forms as published, at least 0 dB whatever the units are." if published else ""
+    text, dashed = "Largest residual over all units with the nominal unit that suits each form best.", ""
     figure, axes = grid(1, len(chosen), sharey=True)
     for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
         draw_forms(panel, model)
-        for form, (freqs, bound) in published.get(name, {}).items():
-            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form])
+        if len(model.output_scale) > len(model.input_scale):  # the published forms of tall plants contain the identity
+            dashed = " Dashed: the output forms as published, at least 0 dB whatever the units are."
+            for form, (freqs, bound) in published_bounds(model, run.models[name]).items():
+                panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form])
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
     legend(axes[0, 0], 3)
-    return figure, text
+    return figure, f"{text} Thick: in use, {used}.{dashed}"
 
 
 def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[AnyArray, AnyArray]]:
@@ -65,8 +53,7 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
     response = models.scaled_responses(freqs, model.unit_ids)
     bounds = dict[Form, tuple[AnyArray, AnyArray]]()
     for form in _PUBLISHED:
-        unit = model.nominals.get(form)
-        row = model.unit_ids.index(unit) if unit in model.unit_ids else 0
+        row = model.unit_ids.index(model.nominals[form])
         size = sigma_max(residual(form, response[row], response, paper=True))
         bounds[form] = freqs, np.delete(size, row, axis=0).max(axis=0)
     return bounds

@@ -105,8 +105,7 @@ def _numbers(facts: Facts) -> list[Number]:
     """Return the errors of the hidden channels, and how many units are flagged."""
     numbers = []
     for channel in facts.hidden:
-        cell = facts.cells[channel]
-        known = cell.means
+        cell, known = facts.cells[channel], facts.cells[channel].means
         if cell.mean is not None:
             notes = [f"RMS {facts.quantity(channel, known['rms'])}"] if known.get("rms") else []
             if growth := facts.entry.get("left_out_to_training", {}).get(channel):
@@ -197,11 +196,8 @@ def _of_units(facts: Facts) -> Checks:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
     if unlike := units_of_large_errors(facts):
         text = f"Units with several times the error of the others: {some(unlike)}."
-        yield (
-            text,
-            "Inspect these units; leave them out if they are defective, since they make the observer worse.",
-            "units",
-        )
+        action = "Inspect these units; leave them out if they are defective, since they make the observer worse."
+        yield text, action, "units"
 
 
 def units_of_large_errors(facts: Facts) -> list[str]:
@@ -210,10 +206,9 @@ def units_of_large_errors(facts: Facts) -> list[str]:
     rows = [r for r in units if r["channel"] in facts.hidden and r["error_percent"] is not None]
     texts = []
     for (condition, channel), of in grouped(rows, itemgetter("condition", "channel")).items():
-        for row in of if len(of) >= THRESHOLDS.compared else ():
-            others = [r for r in of if r is not row]
-            medians = {key: max(float(np.median([r[key] for r in others])), TINY) for key in ("error_percent", "rms")}
-            ratio = min(row[key] / median for key, median in medians.items())
+        sizes = np.array([(r["error_percent"], r["rms"]) for r in of])
+        for k, row in enumerate(of if len(of) >= THRESHOLDS.compared else ()):
+            ratio = (sizes[k] / np.maximum(np.median(np.delete(sizes, k, axis=0), axis=0), TINY)).min()
             if ratio >= THRESHOLDS.several:
                 place = f"{row['unit']}{in_condition(condition)}"
                 error = f"{number(row['error_percent'])} % in {words(channel)}"
@@ -230,12 +225,11 @@ def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
 
 def _of_errors(facts: Facts) -> Checks:
     """Yield better observers, channels without improvement, and bounds that errors exceed."""
-    table, hidden = facts.table, facts.hidden
-    ratio, others = 1 - THRESHOLDS.better, [name for name in table.cells if name != facts.deployed]
-    better = {n: [c for c in hidden if _smaller(table, n, facts.deployed, [c], ratio)] for n in others}
-    ranked = sorted(others, key=lambda name: (-len(better[name]), table.mean(name, better[name])))
-    best = [next((name for name in ranked if c in better[name]), None) for c in hidden]
-    for name in dict.fromkeys(filter(None, best)):
+    table, hidden, ratio = facts.table, facts.hidden, 1 - THRESHOLDS.better
+    better = {n: [c for c in hidden if _smaller(table, n, facts.deployed, c, ratio)] for n in table.cells}
+    ranked = sorted(better, key=lambda name: (-len(better[name]), table.mean(name, better[name])))
+    best = [name for c in hidden for name in [n for n in ranked if c in better[n]][:1]]
+    for name in dict.fromkeys(best):
         where = "in all hidden channels" if better[name] == hidden else f"of {channels(better[name])}"
         designed = "relift_certified" in facts.observers.get(name, {})
         export = f"`kros export c --observer {name}` exports it."
@@ -332,11 +326,12 @@ def not_improved(facts: Facts) -> list[str]:
     other, ratio = f"{facts.model}/open_loop", 1 - THRESHOLDS.improved
     if facts.deployed == other or other not in facts.table.cells:
         return []
-    return [c for c in facts.hidden if not _smaller(facts.table, facts.deployed, other, [c], ratio)]
+    return [c for c in facts.hidden if not _smaller(facts.table, facts.deployed, other, c, ratio)]
 
 
-def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:
-    """Tell whether the mean errors of one observer are below a ratio of another's in all channels."""
-    known = [c for c in channels if c in table.cells[one] and c in table.cells[other]]
-    pairs = [(table.cells[one][c].mean, table.cells[other][c].mean) for c in known]
-    return len(pairs) == len(channels) and all(a is not None and (b is None or a < ratio * b) for a, b in pairs)
+def _smaller(table: ErrorTable, one: str, other: str, channel: str, ratio: float) -> bool:
+    """Tell whether the mean error of one observer in a channel is below a ratio of another's, which may diverge."""
+    if not all(channel in table.cells[name] for name in (one, other)):
+        return False
+    error, rival = (table.cells[name][channel].mean for name in (one, other))
+    return error is not None and (rival is None or error < ratio * rival)

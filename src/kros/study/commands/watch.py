@@ -52,17 +52,18 @@ def watch(folder: Path, run: Path, out: Path | None, every_s: float, once: bool)
 def waiting(folder: Path, out: Path) -> Waiting:
     """Return recordings without a result."""
     found: Waiting = {}
-    populations = {index.parent: index for index in folder.rglob(f"{INDEX}.json")}
-    files = {path: path for path in folder.rglob("*") if is_file(path) and populations.keys().isdisjoint(path.parents)}
-    for path, changing in sorted((populations | files).items()):
+    populations = {index.parent for index in folder.rglob(f"{INDEX}.json")}
+    files = {path for path in folder.rglob("*") if is_file(path) and populations.isdisjoint(path.parents)}
+    for path in sorted(populations | files):
         if out not in path.parents and not path.name.startswith("."):
             with suppress(FileNotFoundError):  # it has just gone
-                found[place_of(path, changing, folder, out)] = path
+                found[place_of(path, folder, out)] = path
     return {place: path for place, path in found.items() if not place.exists()}
 
 
-def place_of(path: Path, changing: Path, folder: Path, out: Path) -> Path:
+def place_of(path: Path, folder: Path, out: Path) -> Path:
     """Return the file of a result; of a folder of Parquet, the index changes last."""
+    changing = path / f"{INDEX}.json" if path.is_dir() else path
     return out / f"{path.relative_to(folder.parent)}.{digest_of(stamp_of(changing))[:12]}.json"
 
 
@@ -79,7 +80,7 @@ def by_unit(context: Context, folder: Path) -> dict[Path, list[Path]]:
 def judged_before(path: Path, folder: Path, out: Path) -> bool:
     """Tell whether a recording, as it is now, has a result and was not refused."""
     with suppress(FileNotFoundError):  # it has just gone
-        place = place_of(path, path, folder, out)
+        place = place_of(path, folder, out)
         return place.exists() and read_json(place)["verdict"] != REFUSED
     return False
 
@@ -88,11 +89,11 @@ def judged(
     context: Context, path: Path, place: Path, folder: Path, out: Path, of_unit: Sequence[Path]
 ) -> Iterator[str]:
     """Check one recording in a folder like its own, and write its result; yield its line, none if it changed."""
-    name, data, changing = path.relative_to(folder), path, path / f"{INDEX}.json"
+    data = path
     with draft_beside(out) as draft:
         try:
             if path.is_file():
-                data, changing = draft, path
+                data = draft
                 for part in (path, *(other for other in of_unit if judged_before(other, folder, out))):
                     copy = draft / part.relative_to(folder)
                     copy.parent.mkdir(parents=True, exist_ok=True)
@@ -102,8 +103,8 @@ def judged(
         except (KrosError, OSError) as error:
             verdict, reason, rows = REFUSED, str(error).replace(str(draft), str(folder)), []
     with suppress(FileNotFoundError):
-        if place == place_of(path, changing, folder, out):
-            recording = str(name).encode(errors="backslashreplace").decode()
+        if place == place_of(path, folder, out):
+            recording = str(path.relative_to(folder)).encode(errors="backslashreplace").decode()
             result = {"recording": recording, "verdict": verdict, "reason": reason, "rows": rows}
             write_json(place, {"schema": 1, **result})
             yield f"{verdict:<9}  {recording}: {reason}"

@@ -14,14 +14,15 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import compress
 
 import numpy as np
 
-from ...core import ConfigError, IdentificationError, KrosError, Progress, Record, load_artifact, save_artifact
+from ...core import ConfigError, KrosError, Progress, Record, load_artifact, save_artifact
 from ...data import split_episodes
 from ...evaluate.held_out import HeldOut
 from ...evaluate.over_units import fewest_units, next_unit_bound
-from ...identify.calibration import Values, unit_parameters
+from ...identify.calibration import unit_parameters, unit_values
 from ...identify.identified import recordings_of, recordings_path
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
@@ -115,8 +116,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     results, roles = outcomes(context, estimation(context, episodes)), dict.fromkeys(held, FOLDER)
     rows = [row for item in results.items() for row in episodes.rows(*item, roles)]
     others = {name: outcome.facts for name, outcome in results.items() if name not in record["facts"]}
-    parameters = {unit: values for unit, values in units.items() if values}
-    content = {"units": held, "parameters": parameters, "rows": rows, "observers": {**record["facts"], **others}}
+    content = {"rows": rows, "observers": {**record["facts"], **others}}
     save_artifact(context.store.draft("evaluation"), KIND, content)
 
 
@@ -139,13 +139,9 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     splits = split_episodes(whole, context.config.split.test).values()
     train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
     facts = replace(facts, groups=dict.fromkeys(facts.reserve, ""), train=train, test=test, reserve=())
-    known, failed, rows = Values(), dict[str, str](), Rows()
-    for unit in facts.groups:
-        try:
-            known |= unit_parameters(whole.select([unit]), context.calibration, facts.identify_on, facts)
-        except IdentificationError as error:
-            failed[unit] = str(error)
-    if keys := tuple(k for k in test if k.unit in known):
+    known, _, failed = unit_values(whole, context.calibration, facts.identify_on, facts=facts)
+    rows = Rows()
+    if keys := tuple(k for k in test if k.unit not in failed):
         episodes = HeldOut(whole, keys, known, sensor=context.config.sensor, band_hz=band_hz(context))
         (outcome,) = episodes.observers([context.deployed])
         rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"))
@@ -157,22 +153,22 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
 def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> Record:
     """Bound the next unit's errors in some channels, in percent and in RMS, all together."""
     places = [(channel, measure) for channel in channels for measure in _MEASURES]
-    errors, pooled = ({(c, m): [r[m] for r in of if r["channel"] == c] for c, m in places} for of in (rows, known))
-    scale = {place: float(np.mean(of)) for place, of in pooled.items() if of}
-    scale = {place: size for place, size in scale.items() if np.isfinite(size) and size > 0}
-    units, needed, bounds = len({r["unit"] for r in rows}), fewest_units(confidence), None
-    if not scale:
+    errors, pooled = (
+        np.array([[r[m] for r in of if r["channel"] == c] for c, m in places], float) for of in (rows, known)
+    )
+    scale = pooled.mean(axis=1)
+    usable, units = np.isfinite(scale) & (scale > 0), errors.shape[1]
+    bounds = next_unit_bound(errors[usable].T, scale[usable], confidence) if usable.any() else None
+    if not usable.any():
         reason = "the observer has no finite error on the units that it was made from"
-    elif units < needed:
-        reason = f"{units} units in reserve, and a confidence of {confidence:g} needs {needed}"
-    else:
-        of_units = np.array([errors[place] for place in scale], dtype=float).T
-        bounds = next_unit_bound(of_units, list(scale.values()), confidence)
+    elif bounds is None:
+        reason = f"{units} units in reserve, and a confidence of {confidence:g} needs {fewest_units(confidence)}"
+    elif not np.isfinite(bounds).all():
         reason = "the observer diverges on too many of the units in reserve, or they cannot be calibrated"
-    if bounds is None or not np.isfinite(bounds).all():
-        return {"bounds": None, "reason": reason}
-    values = dict(zip(scale, bounds.tolist(), strict=True))
-    return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
+    else:
+        values = dict(zip(compress(places, usable), bounds.tolist(), strict=True))
+        return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
+    return {"bounds": None, "reason": reason}
 
 
 def facts_of_folds(folds: Sequence[dict[str, Record]]) -> dict[str, Record]:

@@ -125,10 +125,7 @@ def message(error: Exception) -> str:
         reason = str(error) or "no details"
         return f"Memory: there is not enough of it ({reason}); use fewer --workers, shorter episodes or fewer units."
     if isinstance(error, OSError):
-        given = error.filename, error.filename2
-        names = [repr(os.fspath(name)) for name in given if isinstance(name, str | bytes | os.PathLike)]
-        place = f": {' -> '.join(names)}" if names else ""
-        return f"Files: {error.strerror or error}{place}; check the path, its permissions and the space that is left."
+        return f"Files: {error}; check the path, its permissions and the space that is left."
     return (
         f"Internal error, a defect of kros: {type(error).__name__}: {error}; run the command again as kros --debug ... "
         "for its traceback, and report it."

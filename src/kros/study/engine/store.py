@@ -21,7 +21,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from ...core import ConfigError, DataError, DimensionError, Record, frozen
-from ...core.artifacts import digest_of, file_digest, read_json, with_checksum, write_json
+from ...core.artifacts import as_written, digest_of, file_digest, read_json, with_checksum, write_json
 from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy
 from ...report.manifest import INDEX, MANIFEST, Artefact, describe, place, read_manifest, recorded_files, write_manifest
 from ..config import Stage, StudyConfig, stored_config
@@ -223,29 +223,15 @@ def require_own(out: Path, config: StudyConfig) -> bool:
         return True
     if not (out / STUDY).exists():
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
-    there, this = _identity(_read_study(out)), _identity(config.dump())
+    with as_written("study", out / STUDY):
+        study = read_json(out / STUDY)
+        there, this = (study["name"], study["data"]["source"]), (config.name, str(config.data.source))
     if there != this:
         raise ConfigError(
             f"Output {out}: holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}; name "
             "another folder, or remove this one if it is not needed."
         )
     return False
-
-
-def _identity(study: Record) -> tuple[str, str]:
-    """Return a study's name and where its recordings are: what makes a changed study the same study still."""
-    data = study.get("data")
-    return str(study.get("name")), str(Path(str(data.get("source"))).resolve()) if isinstance(data, dict) else "nowhere"
-
-
-def _read_study(folder: Path) -> Record:
-    try:
-        content = read_json(folder / STUDY)
-    except DataError as error:
-        raise ConfigError(f"Run {folder}: its {STUDY} cannot be read ({error}); name another folder.") from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"Run {folder}: its {STUDY} holds no study; name another folder.")
-    return content
 
 
 @contextmanager
@@ -273,7 +259,7 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
 
 def load_run(folder: Path) -> tuple[StudyConfig, Store]:
     """Read the study of a run folder."""
-    folder = Path(folder)
-    if not (folder / STUDY).exists():
+    path = folder / STUDY
+    if not path.exists():
         raise ConfigError(f"Run {folder}: there is no {STUDY} in it; name the folder that kros run or kros demo wrote.")
-    return stored_config(_read_study(folder), folder / STUDY), Store(folder)
+    return stored_config(read_json(path), path), Store(folder)

@@ -144,10 +144,8 @@ def _lag(lag_s: float | None) -> str:
 def _stopping(facts: Facts) -> Checks:
     """Yield what stops, what to do, and where the details are."""
     hidden = facts.hidden
-    if not facts.deployed:
-        yield "The run stopped before an observer was designed.", "Run it to its end.", "run"
-    elif not facts.cells:
-        yield f"“{facts.label}” has not been evaluated.", "Run it to its end.", "run"
+    if not facts.cells:
+        yield "The run stopped before an observer was designed and evaluated.", "Run it to its end.", "run"
     elif any(facts.cells[c].mean is None or _worst(facts, c)[1].diverged for c in hidden):
         text = f"The estimates of “{facts.label}” diverge on held-out episodes."
         yield text, "Do not use it; look at the models first.", "models"
@@ -185,13 +183,13 @@ def _of_units(facts: Facts) -> Checks:
     if flagged := [r for r in rows if r["outlier"]]:
         text = f"Flagged as not belonging to the batch: {units_text(flagged)}."
         yield text, "Inspect these units before they are shipped.", "units"
-    if short := [r for r in undecided(rows) if r["status"] == "not enough data"]:
-        most = max(short, key=lambda r: float(r["needed_s"]))
-        need = f"{most['unit']} needs {number(most['needed_s'])} s, has {number(most['recorded_s'])} s"
-        yield _inconclusive(short, rows), f"Record longer: {need}.", "units"
-    if few := [r for r in undecided(rows) if r["status"] == "cannot tell"]:
-        action = "Score against more units in one condition, at least 8, that are more alike."
-        yield _inconclusive(few, rows), action, "units"
+    actions = {
+        "not enough data": "Record longer.",
+        "cannot tell": "Score against more units in one condition, at least 8, that are more alike.",
+    }
+    for status, action in actions.items():
+        if few := [r for r in rows if r.get("status") == status]:
+            yield _inconclusive(few, rows), action, "units"
     if remarks := [f"{r['unit']} ({r['status']})" for r in facts.get("units") if r.get("status", "ok") != "ok"]:
         yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
     if unlike := units_of_large_errors(facts):
@@ -266,10 +264,6 @@ def _of_certificates(facts: Facts) -> Checks:
         yield text, "Do not rely on the bounds for these units.", "certificates"
     if facts.observers and all(label_of(name).baseline for name in facts.observers):
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
-    bound = facts.get("uncertainty").get(facts.model, {}).get("weight", {}).get("cover_max")
-    if bound is not None and bound > 1:
-        action = "Use kros.quantify with a larger max_order in Python."
-        yield "The weights do not bound all units that they were fitted to.", action, "uncertainty"
     for fold, why in facts.get("left_out").get("failed", {}).items():
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...core import AnyArray, ConfigError
-from ...data import Population, Role, some
+from ...data import Channel, Population, some
 from ...evaluate.errors import error_spectrum
 from ...identify import PhaseCalibration
 from ..canvas import (
@@ -36,36 +36,37 @@ def recorded_episodes(run: RunFolder) -> list[Shown]:
 
 
 def signals(run: RunFolder) -> Captioned:
-    """Draw one episode in at most two conditions, side by side, with references."""
-    shown, channels, targets = recorded_episodes(run)[:2], run.states[: DRAWING.states], references(run.channels)
-    figure, axes = grid(len(channels), len(shown), sharey="row", sharex="col")
-    for column, episode in zip(axes.T, shown, strict=True):
-        for i, channel in enumerate(channels):
-            if channel.name in targets:
-                reference = episode.inputs[:, targets[channel.name]]
-                draw_line(column[i], episode.time_s, reference, _REFERENCE, "reference")
-            draw_line(column[i], episode.time_s, episode.states[:, i], _RECORDED, "recorded")
-        column[0].set_title(episode_title(episode.key))
-    label_rows(axes[:, 0], channels)
-    label_below(axes[-1], "time (s)")
-    figure.align_ylabels(axes[:, 0])
-    legend(axes[0, 0])
-    return figure, "The same unit in two conditions." if len(shown) == 2 else ""
+    """Draw one episode in at most two conditions, side by side."""
+    shown = recorded_episodes(run)[:2]
+    return recorded_figure(run.channels, shown), "The same unit in two conditions." if len(shown) == 2 else ""
 
 
 def population_figure(population: Population, unit: str | None = None, condition: str | None = None) -> Figure:
-    """Draw all channels of the first episode of a unit, inputs in gold."""
+    """Draw the first episode of a unit."""
     keys = population.keys(unit, condition)
     if not keys:
         raise ConfigError("Plot: the population has no such episodes; see its unit_ids and conditions.")
-    values = population.read(keys[0])
-    figure, axes = grid(len(population.channels), 1, sharex=True)
-    time_s = np.arange(len(values)) * population.sample_period_s
-    for panel, channel, line in zip(axes[:, 0], population.channels, values.T, strict=True):
-        draw_line(panel, time_s, line, _RECORDED if channel.role is Role.STATE else _REFERENCE, channel.name)
-    label_rows(axes[:, 0], population.channels)
-    axes[0, 0].set_title(episode_title(keys[0]))
+    shown = Shown(keys[0], population.sample_period_s, *population.read_parts(keys[0]))
+    return recorded_figure(population.channels, [shown])
+
+
+def recorded_figure(channels: Sequence[Channel], episodes: Sequence[Shown]) -> Figure:
+    """Draw states and inputs of episodes, a column each; an input that is the reference of a state is behind it."""
+    targets, names = references(channels), [channel.name for channel in channels]
+    n_states = episodes[0].states.shape[1]
+    rows = [k for k in range(len(names)) if k - n_states not in targets.values()]
+    figure, axes = grid(len(rows), len(episodes), sharey="row", sharex="col")
+    for column, episode in zip(axes.T, episodes, strict=True):
+        values = np.hstack([episode.states, episode.inputs])
+        for panel, k in zip(column, rows, strict=True):
+            if (target := targets.get(names[k])) is not None:
+                draw_line(panel, episode.time_s, episode.inputs[:, target], _REFERENCE, "reference")
+            draw_line(panel, episode.time_s, values[:, k], _RECORDED, "recorded")
+        column[0].set_title(episode_title(episode.key))
+    label_rows(axes[:, 0], [channels[k] for k in rows])
     label_below(axes[-1], "time (s)")
+    figure.align_ylabels(axes[:, 0])
+    legend(axes[0, 0])
     return figure
 
 

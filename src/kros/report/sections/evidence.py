@@ -115,12 +115,10 @@ def uncertainty(facts: Facts) -> Section | None:
     rows = list[Row]()
     for name, entry in entries.items():
         weight, noise = entry["weight"], entry.get("noise_share")
-        largest = weight["cover_max"]
         row = {
             "model": model_label(name),
             "orders, left and right": " and ".join(", ".join(map(str, side)) for side in weight["orders"]),
-            "largest normalised residual": number(largest, 6),
-            "bounds every unit": None if largest is None else largest <= 1,
+            "largest normalised residual": number(weight["cover_max"], 6),
             "above the optimal bound (dB)": weight["overbound_db_max"],
             "estimation noise in the spread (%)": noise and 100 * noise["at_peak"],
             "approximation error": entry["misfit_max"],

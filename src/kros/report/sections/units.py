@@ -13,7 +13,7 @@ from ..names import in_condition, number, words
 from ..theme import DRAWING
 
 _ERRORS = {"error (%)": "error_percent", "against the true signal (%)": "true_error_percent"}
-_OF_SCORES = {"score (dB)": "score", "detectable change of gain (%)": "detectable"}
+_OF_SCORES = {"score (dB)": "score", "detectable change of gain (%)": "detectable", "recordings needed (s)": "needed_s"}
 _SCORES = (
     "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. A "
     "unit above the threshold is flagged. A change of a hidden state's gain below the detectable one is not."
@@ -51,8 +51,9 @@ def units(facts: Facts) -> Section | None:
 def _row(row: ByName, errors: Sequence[ByName], scores: Sequence[ByName]) -> Row:
     """Return what is known of a unit: errors by channel, scores by condition."""
     known = {(r["channel"], key): r.get(key) for r in errors for key in _ERRORS.values()}
-    known |= {(r["condition"], "score"): r.get("score") for r in scores}
-    known |= {(r["condition"], "detectable"): max(r.get("detectable", {}).values(), default=None) for r in scores}
+    for r in scores:
+        score = {**r, "detectable": max(r.get("detectable", {}).values(), default=None)}
+        known |= {(r["condition"], key): score.get(key) for key in _OF_SCORES.values()}
     percent = [math.inf if r["error_percent"] is None else r["error_percent"] for r in errors]
     phase = row.get("phase_rad")
     about = {"unit": row["unit"], "status": _status(row, scores), "largest": max(percent, default=0.0)}

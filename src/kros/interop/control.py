@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import DataError, DimensionError, MissingDependencyError, StateSpace
+from ..core import DataError, DimensionError, MissingDependencyError, StateSpace, block_diagonal, gain
 
 try:
     import control
@@ -110,24 +110,20 @@ def from_control(system: Any) -> StateSpace:
             f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, "
             "C, D, 0.001), or 0."
         )
-    system = _realised(system) if isinstance(system, control.TransferFunction) else system
+    if isinstance(system, control.TransferFunction):
+        return _realised(system)
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
     return StateSpace(A, B, C, D, float(system.dt))
 
 
-def _realised(model: Any) -> Any:
-    """A transfer function, entry by entry: no minimal realisation is needed for a frequency response."""
-    rows, columns = np.eye(model.noutputs), np.eye(model.ninputs)
-    total = control.ss([], [], [], np.zeros((model.noutputs, model.ninputs)), model.dt)
-    for i, j in np.ndindex(model.noutputs, model.ninputs):
-        try:
-            entry = control.ss(control.tf(model.num[i][j], model.den[i][j], model.dt))
-        except ValueError as error:
-            raise DataError(
-                f"from_control: entry ({i}, {j}) of the transfer function is improper; give a causal model."
-            ) from error
-        total = total + rows[:, [i]] * entry * columns[[j]]
-    return total
+def _realised(model: Any) -> StateSpace:
+    """Realise a transfer function, entry by entry: a frequency response needs no minimal realisation."""
+    p, m, dt = model.noutputs, model.ninputs, float(model.dt)
+    try:
+        entries = block_diagonal([from_control(control.ss(model[i, j])) for i, j in np.ndindex(p, m)])
+    except ValueError as error:
+        raise DataError("from_control: an entry of the transfer function is improper; give a causal model.") from error
+    return gain(np.kron(np.eye(p), np.ones(m)), dt) @ entries @ gain(np.tile(np.eye(m), (p, 1)), dt)
 
 
 def _label(name: str) -> str:

@@ -157,17 +157,13 @@ def score_condition(
     """Score all units that were recorded in one condition."""
     condition, training = models.condition, training_keys(population)
     everything = {unit: keys for unit, c, keys in population.groups() if c == condition}
-    units = [u for u in population.unit_ids if training.get((u, condition))]
-    parameters: Values = {u: {} for u in units}
-    if models.lifting.parameters:
-        parameters = unit_parameters(population.select(units), context.calibration, context.facts.identify_on)
-    tasks = [(population.select([u], [condition]), everything[u], models.lifting) for u in units]
+    parameters = unit_parameters(population.select(everything), context.calibration, context.facts.identify_on)
+    tasks = [(population.select([u], [condition]), keys, models.lifting) for u, keys in everything.items()]
     factors = EpisodeFactors.load(context.store.path("factors", quote(condition, safe="")))
     recorded, rows = Recorded.of(factors, models, outliers.freqs_hz), Rows()
     halves = recorded.halves()
     motion = None if halves is None else outliers.motion_levels(*halves)
-    for unit, factor in zip(units, executor.map(reduce_episodes, tasks), strict=True):
-        keys = everything[unit]
+    for (unit, keys), factor in zip(everything.items(), executor.map(reduce_episodes, tasks), strict=True):
         chosen = [keys.index(k) for k in training[unit, condition]]
         evidence = Evidence.of(factor, models, parameters[unit]).part(chosen)
         known = recorded.same_recordings(factor)

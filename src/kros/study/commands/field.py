@@ -72,17 +72,12 @@ def hidden_states(observer: Observer) -> Names:
 
 def check_channels(population: Population, observer: Observer, *, hidden: bool = True) -> None:
     """Refuse other channels, units of measure or sampling periods than those of the run, perhaps of hidden states."""
-    expected, there = (observer.recorded, observer.inputs), (population.states, population.inputs)
-    needed = (*observer.outputs, *observer.inputs)
-    names = [*population.states, *population.inputs]
-    if not hidden and (missing := [name for name in needed if name not in names]):
+    needed = (*(observer.recorded if hidden else observer.outputs), *observer.inputs)
+    there = (*population.states, *population.inputs)
+    if (hidden and needed != there) or not set(needed) <= set(there):
         raise DataError(
-            f"Channels: {', '.join(missing)} is missing, which the observer reads; there are {', '.join(names)}; "
-            "record it, or correct the mapping."
-        )
-    if hidden and expected != there:
-        raise DataError(
-            f"Channels: the run has states and inputs {expected}, the recordings {there}; read them the same way."
+            f"Channels: the observer needs {', '.join(needed)}, the recordings have {', '.join(there)}; record what is "
+            "missing, or correct the mapping."
         )
     units = observer.about.get("units_of_measure", {})
     for channel in population.channels:

@@ -165,8 +165,8 @@ def test_a_part_of_a_run_has_a_report(tmp_path) -> None:
     assert "stopped before an observer was designed" in text
     assert "NOT READY" in text
     assert all((drawn := draw(name, RunFolder(tmp_path))).figure is None and drawn.reason for name in FIGURES)
-    (tmp_path / "evaluation").mkdir()
-    name = "evaluation/evaluation.json"
+    name = "evaluation/shown/0/shown.json"
+    (tmp_path / name).parent.mkdir(parents=True)
     (tmp_path / name).write_text("{")
     files = {name: describe(tmp_path / name), "population/facts.json": describe(tmp_path / "population" / "facts.json")}
     write_manifest(tmp_path, {"evaluate": Artefact(digest=64 * "0", files=files)})

@@ -6,7 +6,7 @@ Only files in the records of the run count. What a run does not have raises `Not
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from ..core import AnyArray, Names, Record, frozen, load_artifact
+from ..core import AnyArray, Names, Record, Storable, frozen, load_artifact
 from ..core.arrays import T
 from ..data.population import Channel, Channels, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
@@ -31,9 +31,10 @@ class NotShownError(Exception):
 
 
 @frozen
-class Shown:
+class Shown(Storable):
     """One held-out episode with the estimates of observers and the predictions of models."""
 
+    KIND = "shown"
     key: EpisodeKey
     sample_period_s: float
     states: AnyArray  # shape (n_samples, n)
@@ -144,26 +145,16 @@ class RunFolder:
         """Name of the deployed observer, where there is one."""
         return self._record("observers/observers.json").get("deployed")
 
-    @cached_property
-    def evaluation(self) -> tuple[Record, dict[str, AnyArray]]:
-        """Errors of all observers and models, and the signals that are shown."""
-        reason = "the observers have not been evaluated yet"
-        return load_artifact(self._require("evaluation/evaluation.json", reason), "evaluation")
+    @property
+    def band_hz(self) -> Sequence[float] | None:
+        """The band around the gearbox frequency at top speed, where there is one."""
+        return self._record("evaluation/evaluation.json").get("band_hz")
 
     @cached_property
     def shown(self) -> list[Shown]:
         """Episodes with estimates: nominal unit, worst off-nominal unit, and the nominal unit in other conditions."""
-        content, arrays = self.evaluation
-
-        def below(start: str) -> dict[str, AnyArray]:
-            return {n.removeprefix(start): values for n, values in arrays.items() if n.startswith(start)}
-
-        shown = []
-        for k, row in enumerate(content["shown"]):
-            signals = self.sample_period_s, arrays[f"shown{k}/states"], arrays[f"shown{k}/inputs"]
-            observers, models = below(f"shown{k}/observer/"), below(f"shown{k}/model/")
-            shown.append(Shown(EpisodeKey(*row), *signals, observers, linear_first(models)))
-        return shown
+        reason = "the observers have not been evaluated yet"
+        return list(self._load("evaluation/shown/([^/]+)/shown.json", Shown.load, reason).values())
 
     def _record(self, name: str) -> Record:
         """Return the content of an artifact; nothing where the run does not have it."""

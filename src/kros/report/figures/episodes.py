@@ -24,6 +24,7 @@ from ..names import (
     episode_title,
     is_koopman,
     joined,
+    linear_first,
     model_label,
     model_look,
     number,
@@ -51,6 +52,7 @@ class Block:
     shown: Shown
     lines: Lines  # values, shape (n_samples, n), by label
     states: Sequence[int]
+    truth: str = "recorded"  # what the states are called
 
 
 def free_run(run: RunFolder) -> Captioned:
@@ -58,7 +60,7 @@ def free_run(run: RunFolder) -> Captioned:
     shown = run.shown[0]
     if not shown.models:
         raise NotShownError("no model was simulated on the episode that is shown")
-    lines = {model_label(n): (values, model_look(n)) for n, values in shown.models.items()}
+    lines = {model_label(n): (values, model_look(n)) for n, values in linear_first(shown.models).items()}
     block = Block(episode_title(shown.key), shown, lines, range(len(run.states)))
     text = "Simulation from the first recorded state with the recorded inputs, without measurements."
     return _figure(run, [block], text)
@@ -107,10 +109,9 @@ def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[i
 def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> Captioned:
     """Return the figure of some episodes of a run and its caption; enlarged are some turns of the gearbox, or less."""
     blocks = [replace(block, states=block.states[: DRAWING.states]) for block in blocks]
-    band_hz, samples = run.evaluation[0]["band_hz"], len(run.shown[0].states)
-    size = DRAWING.zoom if run.has("calibration/calibration.json") else samples // 8
-    text += " Shaded: the band around the gearbox frequency at top speed." if band_hz else ""
-    return blocks_figure(run.channels, blocks, size, band_hz), text
+    size = DRAWING.zoom if run.has("calibration/calibration.json") else len(run.shown[0].states) // 8
+    text += " Shaded: the band around the gearbox frequency at top speed." if run.band_hz else ""
+    return blocks_figure(run.channels, blocks, size, run.band_hz), text
 
 
 def blocks_figure(
@@ -144,7 +145,7 @@ def _draw_state(row: Sequence[Axes], block: Block, i: int, window: slice) -> Non
     time_s, recorded = shown.time_s, shown.states[:, i].astype(float)
     start = int(DRAWING.settled * len(recorded))
     for panel, part in ((row[0], slice(None)), (row[1], window)):
-        draw_line(panel, time_s[part], recorded[part], TRUTH, "recorded")
+        draw_line(panel, time_s[part], recorded[part], TRUTH, block.truth)
         for label, (values, look) in block.lines.items():
             draw_line(panel, time_s[part], _inside(values[part, i], recorded), look, label)
     row[0].axvspan(*time_s[window][[0, -1]], color=Tone.GRID, lw=0, zorder=0.5)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
@@ -19,6 +19,7 @@ from ...evaluate.held_out import HeldOut, Outcome, alike
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
 from ...observer.baselines.trained import Regressor
+from ...report.run_folder import Shown
 from ..engine.context import Context
 from .load import run_load
 
@@ -45,12 +46,15 @@ def run(context: Context) -> None:
         "rows": [row for item in results.items() for row in episodes.rows(*item, roles)],
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
         "band_hz": episodes.band_hz,
-        "shown": [[k.unit, k.condition, k.episode] for k in episodes.shown],
         "baselines": {name: outcome.facts for name, outcome in results.items() if name not in observers},
         "recorded": episodes.rows("recorded", episodes.recorded(), roles) if population.truths else [],
     }
-    arrays = _arrays(episodes, results, free_runs)
-    save_artifact(context.store.draft("evaluation"), "evaluation", content, arrays)
+    save_artifact(context.store.draft("evaluation"), "evaluation", content)
+    for number, key in enumerate(episodes.shown):
+        shown = [{n: single(o.shown[key]) for n, o in of.items() if key in o.shown} for of in (results, free_runs)]
+        states, inputs = map(single, population.read_parts(key))
+        one = Shown(key, population.sample_period_s, states, inputs, *shown)
+        one.save(context.store.draft("evaluation", "shown", str(number)))
     run_load(context, observers)
 
 
@@ -133,16 +137,7 @@ def load_observers(context: Context) -> dict[str, Observer]:
     return {name: Observer.load(context.store.path("observers", f"{name}.json")) for name in names}
 
 
-def _arrays(
-    episodes: HeldOut, estimates: Mapping[str, Outcome], free_runs: Mapping[str, Outcome]
-) -> dict[str, AnyArray]:
-    """Collect the trajectories that figures need, in single precision."""
-    arrays = dict[str, Array]()
-    for number, key in enumerate(episodes.shown):
-        start = f"shown{number}"
-        arrays[f"{start}/states"], arrays[f"{start}/inputs"] = episodes.population.read_parts(key)
-        for kind, results in (("observer", estimates), ("model", free_runs)):
-            shown = {f"{start}/{kind}/{name}": outcome.shown for name, outcome in results.items()}
-            arrays |= {name: of[key] for name, of in shown.items() if key in of}
-    with np.errstate(over="ignore"):  # an estimate that diverged becomes infinite
-        return {name: values.astype(np.float32) for name, values in arrays.items()}
+def single(values: Array) -> AnyArray:
+    """Return signals for figures, in single precision; an estimate that diverged becomes infinite."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)

@@ -23,6 +23,7 @@ from ...motor_drive import AngleLoad
 from ...motor_drive.observer import LoadSettings, load_observer
 from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
 from ...observer import EstimatorSettings, Observer, run_observer
+from ...report.run_folder import Shown
 from ..config import LoadConfig
 from ..engine.context import Context
 
@@ -73,21 +74,21 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
         except KrosError as error:
             fact = {"status": "failed", "reason": str(error)}
             log.info("%s could not be computed: %s", name, error)
-        facts |= {name: fact} if fact else {}
+        facts[name] = fact
     shown = next(i for i, key in enumerate(trial.test.keys) if key.condition == TRIAL.condition)
-    key = trial.test.keys[shown]
     content = {
         "known": trial.known,
         "rows": [trial.row(*item) for item in curves.items()],
         "observers": facts,
         "corner_hz": TRIAL.judged_hz,
         "settle_s": TRIAL.settle_s,
-        "estimates": list(curves),
-        "shown": [key.unit, key.condition, key.episode],
     }
-    arrays = {"truth": trial.truth[1]} | {f"estimate/{n}": values for n, values in curves.items()}
-    single = {name: values[:, shown].astype(np.float32) for name, values in arrays.items()}
-    save_artifact(context.store.draft(LOAD), LOAD, content, single)
+    save_artifact(context.store.draft(LOAD), LOAD, content)
+    signals = trial.truth[1][:, [shown]], trial.test.inputs[:, shown]
+    single = Shown(
+        trial.test.keys[shown], trial.test.sample_period_s, *signals, {n: v[:, [shown]] for n, v in curves.items()}
+    )
+    single.save(context.store.draft(LOAD, "shown"))
 
 
 def load_metrics(context: Context) -> Record:

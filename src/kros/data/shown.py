@@ -61,4 +61,4 @@ class Shown:
         >>> len(motors.plot().axes)  # position, velocity, current and voltage
         4
         """
-        return import_module("kros.report.plotting").plot(self, kind, **options)
+        return import_module("kros.report.figures").plot(self, kind, **options)

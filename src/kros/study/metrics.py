@@ -8,7 +8,6 @@ from __future__ import annotations
 from ..core import Record, load_artifact, plain
 from ..evaluate.over_units import interval_rows
 from ..observer.sensor_gains import sensor_gains
-from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel
 from .config import Stage
 from .engine.context import Context
@@ -122,13 +121,7 @@ def _uncertain_model(store: Store, name: str, model: UncertainModel) -> Record:
 
 def _observers(context: Context) -> Record:
     """Observers with what their synthesis and certificates state, and what the deployed one reads."""
-    record = context.observers_record
-    entries = {name: dict(facts) for name, facts in record["facts"].items()}
-    for name in record["names"]:
-        synthesis = Synthesis.load(context.store.path("synthesis", name))
-        bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
-        entries[name] |= {key: getattr(synthesis, key) for key in ("status", "h2_norm", "hinf_norm", *bounds)}
-    return {"observers": entries, "deployment": _deployment(context)}
+    return {"observers": dict(context.observers_record["facts"]), "deployment": _deployment(context)}
 
 
 def _deployment(context: Context) -> Record:

@@ -1,10 +1,11 @@
-"""Figures: one row of one table each, in the order of the paper's argument.
+"""Figures of a run: one row of one table each, in the order of the paper's argument; and of results in memory.
 
 The function of a row takes a `RunFolder`; it returns the figure and more of its caption.
 """
 
 from collections.abc import Callable
 from importlib import import_module
+from inspect import signature
 from typing import Any
 
 from ...core import ConfigError, frozen
@@ -79,3 +80,38 @@ def run_figure(run: Any, name: str = "observers_in_time") -> Figure:
     if drawn.figure is None:
         raise ConfigError(f"Plot of a run: the figure {name!r} is left out, {drawn.reason}.")
     return drawn.figure
+
+
+_ESTIMATES = {"estimates": "episodes:design_figure"}
+PLOTS: dict[str, dict[str, str]] = {
+    "Population": {"recorded": "recordings:population_figure"},
+    "ModelSet": {"bode": "models:bode_figure"},
+    "IdentifiedModels": {
+        "bode": "models:identified_bode",
+        "compare": "episodes:compare_figure",
+    },
+    "UncertainModel": {"weights": "uncertainty:uncertain_figure"},
+    "UncertainModels": {"weights": "uncertainty:sets_figure"},
+    "Design": _ESTIMATES,
+    "Observer": _ESTIMATES,
+    "RunResult": {"figure": ":run_figure"},
+}
+"""Class -> kind of figure -> module and function that draws it; its further parameters are the options of `plot`."""
+
+
+def plot(result: Any, kind: str | None, **options: Any) -> Figure:
+    """Draw a result."""
+    name = type(result).__name__
+    kinds = next((PLOTS[t.__name__] for t in type(result).__mro__ if t.__name__ in PLOTS), {})
+    kind = kind or next(iter(kinds), "")
+    if kind not in kinds:
+        raise ConfigError(f"Plot: a {name} has no figure of kind {kind!r}; choose one of {', '.join(kinds)}.")
+    function = drawing(kinds[kind])
+    known = list(signature(function).parameters)[1:]
+    if not set(options) <= set(known):
+        raise ConfigError(
+            f"Plot: a {name} has no option {', '.join(options)}; {kind!r} has {', '.join(known) or 'none'}."
+        )
+    with style():
+        figure: Figure = function(result, **options)
+    return figure

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...core import ByName, ConfigError, Progress, digest_of, write_json
+from ...core import ByName, ConfigError, Progress, digest_of, whole_folder, write_json
 from ...data import write_parquet
 from ...data.readers.motor_drive_raw import write_raw
 from ...identify.presets import HARMONIC_DRIVE
@@ -27,16 +27,13 @@ def simulate_to(out: Path, plant: str, layout: str, settings: ByName) -> None:
             raise ConfigError(f"--{name} {value!r}: choose one of {', '.join(allowed)}.")
     if layout == "raw" and plant != HARMONIC_DRIVE:
         raise ConfigError(f"--format raw: is the layout of motor drives; write {plant} as parquet.")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"Output {out}: exists and is not an empty folder; name a new one.")
-    simulated = PLANTS[plant](**settings).simulate()
-    if out.exists():
-        out.rmdir()
-    if layout == "raw":
-        write_raw(simulated.raw, out)
-    else:
-        write_parquet(simulated.population, out)
-    write_json(out / "truth.json", simulated.truth.as_dict())
+    with whole_folder(out) as folder:
+        simulated = PLANTS[plant](**settings).simulate()
+        if layout == "raw":
+            write_raw(simulated.raw, folder)
+        else:
+            write_parquet(simulated.population, folder)
+        write_json(folder / "truth.json", simulated.truth.as_dict())
 
 
 def run_demo(out: Path, settings: ByName, workers: int, progress: Progress, overrides: Sequence[str]) -> RunResult:

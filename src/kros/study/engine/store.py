@@ -161,13 +161,10 @@ class Store:
         write_manifest(self.folder, manifest)
 
     def remove(self) -> None:
-        """Remove a run as far as its manifest lists it, and its folder where nothing else is in it."""
+        """Remove a run that began in a new or empty folder."""
         self.drop(*self.manifest)
-        for name in (MANIFEST, STUDY, METRICS):
-            self.path(name).unlink(missing_ok=True)
-        _sweep(self.artefacts, ())
-        for folder in (self.artefacts, self.folder):
-            _prune(folder, self.folder.parent)
+        for name in (MANIFEST, STUDY, STORE):
+            _remove(self.path(name))
 
     def tidy(self) -> None:
         """Remove what a killed process left half done."""

@@ -102,14 +102,18 @@ def run_synthesize(context: Context) -> None:
     config, draft = context.config, context.store.draft
     tables = config.synthesis, config.observer, config.estimator, config.sensor
     designs = synthesize_all(context.uncertain, *tables, context.work)
+    facts = dict(designs.facts)
     for name, design in designs.designs.items():
+        bounds = () if design.synthesis.worst_case_h2 is None else ("lower_bound", "gap_percent")
+        norms = {key: getattr(design.synthesis, key) for key in ("status", "h2_norm", "hinf_norm", *bounds)}
+        facts[name] = {**facts[name], **norms}
         observer = replace(design.observer, about={**design.observer.about, "study": config.name})
         observer.save(draft("observers", f"{name}.json"))
         design.synthesis.save(draft("synthesis", name))
         if design.certificate is not None:
             design.certificate.save(draft("observers", "relift", name))
     copyfile(draft("observers", f"{designs.deployed}.json"), draft("observers", "deployed.json"))
-    content = {"names": list(designs.designs), "deployed": designs.deployed, "facts": designs.facts}
+    content = {"names": list(designs.designs), "deployed": designs.deployed, "facts": facts}
     save_artifact(draft("observers"), "observers", content)
 
 

@@ -123,7 +123,7 @@ def blocks_figure(
     for block in blocks:
         panels = axes[first : first + len(block.states)]
         first += len(block.states)
-        window = steady_window(channels, block.shown, size)
+        window = window_of(block.shown, size)
         for row, i in zip(panels, block.states, strict=True):
             _draw_state(row, block, i, window)
             row[3].set_ylabel(f"{squared(channels[i].unit)}/Hz", size="small")
@@ -187,20 +187,12 @@ def references(channels: Sequence[Channel]) -> dict[str, int]:
     return {name: inputs.index(f"target_{name}") for name in states if f"target_{name}" in inputs}
 
 
-def steady_window(channels: Sequence[Channel], shown: Shown, size: int) -> slice:
-    """Return a window that begins where the reference is fastest, in the middle of the episode where there is none."""
-    columns, samples = references(channels), len(shown.states)
+def window_of(shown: Shown, size: int) -> slice:
+    """Return a window that begins where the last input is largest, as a reference of speed is at constant speed."""
+    samples = len(shown.states)
     size = max(min(size, samples), 2)
-    first = np.abs(shown.inputs[:, columns["velocity"]]).argmax() if "velocity" in columns else (samples - size) // 2
-    begin = min(int(first), samples - size)
+    begin = min(int(np.abs(shown.inputs[:, -1]).argmax()), samples - size)
     return slice(begin, begin + size)
-
-
-def steady_stretches(speed: AnyArray) -> list[slice]:
-    """Return all stretches within 2 % of the highest speed, each of one direction."""
-    top = float(np.max(np.abs(speed), initial=0.0))
-    fast = (np.ma.masked_where(~(sign * speed > 0.98 * top), speed) for sign in ((1, -1) if top else ()))
-    return sorted((part for one in fast for part in np.ma.clump_unmasked(one)), key=lambda part: int(part.start))
 
 
 def shown_episode(models: IdentifiedModels, unit: str | None, condition: str | None) -> EpisodeKey:

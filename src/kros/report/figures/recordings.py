@@ -24,7 +24,7 @@ from ..canvas import (
 from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
-from .episodes import draw_line, label_rows, references, steady_stretches
+from .episodes import draw_line, label_rows, references
 
 _RECORDED, _REFERENCE = Look(Tone.INK), Look(Tone.GOLD, weight=3, opacity=0.5)
 
@@ -72,42 +72,39 @@ def recorded_figure(channels: Sequence[Channel], episodes: Sequence[Shown]) -> F
 
 def tracking_spectrum(run: RunFolder) -> Captioned:
     """Draw the spectrum of the tracking error at constant speed in every condition (the paper's Figure 4)."""
-    spec = run.calibration.spec
+    spec, names, top = run.calibration.spec, [c.name for c in run.channels], 0.5 / run.sample_period_s
     figure, axes = grid(1, 1)
-    panel, frequency = axes[0, 0], 0.0
+    panel, speed = axes[0, 0], 0.0
     for shown, tone in zip(recorded_episodes(run), (Tone.BLUE, Tone.GOLD, Tone.GREEN), strict=False):
-        freqs, density, frequency = _tracking(run, shown)
+        values = np.hstack([shown.states, shown.inputs]).astype(float)
+        reference, measured = (values[:, names.index(name)] for name in (spec.reference, spec.measured))
+        steady = steady_stretch(reference, round(spec.settle * len(reference)))
+        freqs, density = error_spectrum((reference - measured)[steady], run.sample_period_s, DRAWING.segment)
         panel.plot(freqs[1:], density[1:], color=tone, label=episode_title(shown.key))
+        speed = max(speed, float(np.abs(reference).max()))
     logarithmic(panel)
-    top = 0.5 / run.sample_period_s
+    frequency = spec.ratio * speed / (2 * np.pi)
     count = min(8, int(top / frequency))
-    for multiple in range(1, count + 1):
-        place = multiple * frequency
+    for place in frequency * np.arange(1, count + 1):
         panel.axvline(place, color=Tone.SOFT, lw=DRAWING.thin, ls=":", zorder=1)
         note(panel, f"{place:.0f} Hz", (place, 1), (3, -2), xycoords=("data", "axes fraction"), va="top")
     panel.set_xlim(0, min(top, (count + 0.5) * frequency))
     panel.set_xlabel("frequency (Hz)")
-    unit = next(c.unit for c in run.channels if c.name == spec.measured)
+    unit = run.channels[names.index(spec.measured)].unit
     panel.set_ylabel(f"{spec.measured} error,\nPSD ({squared(unit)}/Hz)")
     legend(panel)
     text = f"{words(spec.reference)} minus {words(spec.measured)} at the highest speed. Dotted: {frequency:.3g} Hz, "
     return figure, text + f"which is {spec.ratio:g} times the speed, and its multiples."
 
 
-def _tracking(run: RunFolder, shown: Shown) -> tuple[AnyArray, AnyArray, float]:
-    """Return frequencies, density and the disturbance's frequency."""
-    spec, names = run.calibration.spec, [c.name for c in run.channels]
-    values = np.hstack([shown.states, shown.inputs]).astype(float)
-    reference, measured = values[:, names.index(spec.reference)], values[:, names.index(spec.measured)]
-    settle = round(spec.settle * len(reference))
-    stretches = [slice(s.start + settle, s.stop) for s in steady_stretches(reference)]
-    segment = min(DRAWING.segment, max((s.stop - s.start for s in stretches), default=0))
-    if segment < 100:
-        raise NotShownError(f"{shown.key} has no stretch of constant speed that is long enough")
-    used = [s for s in stretches if s.stop - s.start >= segment]
-    spectra = [error_spectrum((reference - measured)[s], run.sample_period_s, segment) for s in used]
-    density = np.average([d for _, d in spectra], axis=0, weights=[s.stop - s.start for s in used])
-    return spectra[0][0], density, spec.ratio * float(np.abs(reference).max()) / (2 * np.pi)
+def steady_stretch(speed: AnyArray, settle: int) -> slice:
+    """Return the longest stretch within 2 % of the highest speed, without the samples in which the loop settles."""
+    peak = speed[np.abs(speed).argmax()]
+    fast = speed * peak >= 0.98 * peak**2  # in one direction
+    longest = max(np.ma.clump_unmasked(np.ma.masked_where(~fast, speed)), key=lambda part: part.stop - part.start)
+    if longest.stop - longest.start <= settle:
+        raise NotShownError("no episode has a stretch of constant speed that is long enough")
+    return slice(longest.start + settle, longest.stop)
 
 
 def phase(run: RunFolder) -> Captioned:

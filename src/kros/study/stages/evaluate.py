@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, get_args
+from itertools import chain
+from typing import get_args
 
 import numpy as np
 
-from ...core import AnyArray, Array, KrosError, Names, Record, save_artifact
+from ...core import AnyArray, Array, KrosError, Record, save_artifact
 from ...data import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
@@ -24,7 +25,6 @@ from ..engine.context import Context
 from .load import run_load
 
 log = logging.getLogger(__name__)
-Pieces = dict[Names, Callable[[], Any]]  # work by the names of its results
 
 
 def run(context: Context) -> None:
@@ -35,18 +35,15 @@ def run(context: Context) -> None:
     episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(context))
     episodes = replace(episodes, shown=showcase(context, episodes))
     at_home = replace(episodes, keys=tuple(k for k in keys if k.condition == facts.identify_on))
-    observers = load_observers(context)
-    work = estimation(context, episodes)
-    work |= {(f"free run/{name}",): partial(at_home.models, identified.models(name)) for name in identified.kinds}
-    results = outcomes(context, work)
-    free_runs = {name: results.pop(f"free run/{name}") for name in identified.kinds}
+    models = [partial(at_home.models, identified.models(name)) for name in identified.kinds]
+    simulated = context.work.begin("evaluate", models)
     pooled = {u: "off_nominal" for u in facts.pooled} | {context.uncertain.nominal: "nominal"}
     roles = {u: pooled.get(u, "outlier") for u in facts.groups}
-    content: Record = {
-        "rows": [row for item in results.items() for row in episodes.rows(*item, roles)],
+    results, content = judged(context, episodes, roles)
+    free_runs = dict(zip(identified.kinds, simulated(), strict=True))
+    content |= {
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
         "band_hz": episodes.band_hz,
-        "baselines": {name: outcome.facts for name, outcome in results.items() if name not in observers},
         "recorded": episodes.rows("recorded", episodes.recorded(), roles) if population.truths else [],
     }
     save_artifact(context.store.draft("evaluation"), "evaluation", content)
@@ -55,37 +52,33 @@ def run(context: Context) -> None:
         states, inputs = map(single, population.read_parts(key))
         one = Shown(key, population.sample_period_s, states, inputs, *shown)
         one.save(context.store.draft("evaluation", "shown", str(number)))
-    run_load(context, observers)
+    run_load(context, load_observers(context))
 
 
-def estimation(context: Context, episodes: HeldOut) -> Pieces:
-    """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
-    makers = baseline_makers(context, episodes)
-    work: Pieces = {(name,): partial(of_baseline, episodes, make) for name, make in makers.items()}
-    for group in alike(load_observers(context).values()):
-        work[tuple(observer.name for observer in group)] = partial(episodes.observers, group)
-    return work
+def judged(context: Context, episodes: HeldOut, roles: Mapping[str, str]) -> tuple[dict[str, Outcome], Record]:
+    """Run all observers of a study, then the baselines that are made here, on some episodes; return errors and facts."""
+    groups, makers = alike(load_observers(context).values()), baseline_makers(context, episodes)
+    work: list[Callable[[], list[Outcome]]] = [partial(of_baseline, episodes, make) for make in makers.values()]
+    work += [partial(episodes.observers, group) for group in groups]
+    names = [*makers, *(observer.name for group in groups for observer in group)]
+    outcomes = dict(zip(names, chain.from_iterable(context.work.run("evaluate", work)), strict=True))
+    outcomes = {name: outcomes[name] for name in (*context.observers_record["names"], *makers)}
+    baselines = {name: outcomes[name].facts for name in makers}
+    for name, facts in baselines.items():
+        if facts.get("status") == "failed":
+            log.info("%s could not be computed: %s", name, facts["reason"])
+    rows = [row for item in outcomes.items() for row in episodes.rows(*item, roles)]
+    return outcomes, {"rows": rows, "baselines": baselines}
 
 
-def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> Outcome:
+def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> list[Outcome]:
     """Make a baseline and run it; return the reason where it cannot be made."""
     try:
         baseline = make()
     except KrosError as error:
-        return Outcome(facts={"status": "failed", "reason": str(error)})
-    (outcome,) = episodes.estimates(lambda *batch: [baseline.estimate(*batch)[None]], baseline.measured)
-    return replace(outcome, facts=baseline.facts, estimated=baseline.estimated)
-
-
-def outcomes(context: Context, work: Pieces) -> dict[str, Outcome]:
-    """Do the work; return outcomes by name, observers of the study first, in its order."""
-    by_name = dict[str, Outcome]()
-    for names, result in zip(work, context.work.run("evaluate", work.values()), strict=True):
-        by_name |= dict(zip(names, result if isinstance(result, list) else [result], strict=True))
-    for name, outcome in by_name.items():
-        if outcome.facts.get("status") == "failed":
-            log.info("%s could not be computed: %s", name, outcome.facts["reason"])
-    return {name: by_name[name] for name in dict.fromkeys((*context.observers_record["names"], *by_name))}
+        return [Outcome(facts={"status": "failed", "reason": str(error)})]
+    outcomes = episodes.estimates(lambda *batch: [baseline.estimate(*batch)[None]], baseline.measured)
+    return [replace(outcome, facts=baseline.facts, estimated=baseline.estimated) for outcome in outcomes]
 
 
 def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[], Baseline]]:

@@ -26,11 +26,11 @@ from ...identify.calibration import unit_parameters, unit_values
 from ...identify.identified import recordings_of, recordings_path
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
-from .evaluate import band_hz, estimation, outcomes
+from .evaluate import band_hz, judged
 from .learning import FEWEST, LEARNING
 
 log = logging.getLogger(__name__)
-FOLDER, KIND = Stage.LEFT_OUT.value, "left_out"
+FOLDER = Stage.LEFT_OUT.value
 NEXT = "next_unit"
 _MEASURES = ("error_percent", "rms")
 Rows = list[Record]
@@ -59,7 +59,7 @@ def run(context: Context) -> None:
     if context.facts.reserve:
         save_artifact(context.store.draft(NEXT), NEXT, next_unit(context))
     if folds:
-        save_artifact(context.store.draft(FOLDER), KIND, of_folds(context, folds))
+        save_artifact(context.store.draft(FOLDER), FOLDER, of_folds(context, folds))
 
 
 def results(context: Context) -> Record:
@@ -94,7 +94,7 @@ def run_fold(whole: Context, number: int, units: Sequence[str]) -> Record:
     except KrosError as error:
         log.warning("fold %d: %s", number + 1, error)
         return {"failed": str(error)}
-    return load_artifact(context.store.path("evaluation"), KIND)[0]
+    return load_artifact(context.store.path("evaluation"), FOLDER)[0]
 
 
 def without(whole: Context, held: Sequence[str]) -> StudyConfig:
@@ -109,15 +109,13 @@ def without(whole: Context, held: Sequence[str]) -> StudyConfig:
 
 def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None:
     """Run the observers of a fold on the test episodes of the units that took no part in it."""
-    facts, population, record = whole.facts, whole.population.select(held), context.observers_record
+    facts, population = whole.facts, whole.population.select(held)
     units = unit_parameters(population, context.calibration, facts.identify_on, facts)
     keys = tuple(k for k in facts.test if k.unit in held)
     episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(whole))
-    results, roles = outcomes(context, estimation(context, episodes)), dict.fromkeys(held, FOLDER)
-    rows = [row for item in results.items() for row in episodes.rows(*item, roles)]
-    others = {name: outcome.facts for name, outcome in results.items() if name not in record["facts"]}
-    content = {"rows": rows, "observers": {**record["facts"], **others}}
-    save_artifact(context.store.draft("evaluation"), KIND, content)
+    _, content = judged(context, episodes, dict.fromkeys(held, FOLDER))
+    content["observers"] = {**context.observers_record["facts"], **content.pop("baselines")}
+    save_artifact(context.store.draft("evaluation"), FOLDER, content)
 
 
 def next_unit(context: Context) -> Record:

@@ -24,6 +24,7 @@ from typer.core import TyperGroup
 from .core import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError, Progress
 
 FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
+_CODES = {"PASS": 0, "SAFE": 0, "UNDECIDED": UNDECIDED}  # of verdicts
 _SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _USAGE = [kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"]  # perhaps typer's own
 _PASSED: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_USAGE)
@@ -302,14 +303,14 @@ def check(
     same_unit: Annotated[bool, _option("Compare a unit of the study with the others alone.", "--same-unit")] = False,
 ) -> None:
     """Score new units against a finished study: PASS, FAIL or UNDECIDED; exit code 3 if one fails, 4 undecided."""
-    from .report.unit_verdicts import Verdict, file_writer, verdict_lines, worst
+    from .report.unit_verdicts import file_writer, verdict_lines, worst
     from .study.commands.check import check_units
 
     write = file_writer(out or ())
     scores = check_units(run_folder, data, _count(workers), same_unit)
     _show(quiet, scores, verdict_lines(scores))
     write(scores)
-    raise typer.Exit({Verdict.PASS: 0, Verdict.UNDECIDED: UNDECIDED, Verdict.FAIL: NOT_MET}[worst(scores)])
+    raise typer.Exit(_CODES.get(worst(scores), NOT_MET))
 
 
 @app.command()
@@ -325,7 +326,7 @@ def loop(
 
     result = judge_controller(run_folder, controller, observer)
     _show(quiet, plain(vars(result)), result.lines())
-    raise typer.Exit({"SAFE": 0, "UNDECIDED": UNDECIDED}.get(result.status, NOT_MET))
+    raise typer.Exit(_CODES.get(result.status, NOT_MET))
 
 
 @app.command()

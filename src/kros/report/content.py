@@ -59,7 +59,7 @@ class Table:
 
 @frozen
 class Section:
-    """A section of the report: paragraphs, a list of terms, tables, and one figure."""
+    """A section of the report: paragraphs, lists by what they are of, tables, and one figure."""
 
     key: str  # anchor
     title: str
@@ -67,7 +67,6 @@ class Section:
     card: Pairs = ()
     tables: Sequence[Table | None] = ()
     figure: str = ""
-    lists: Pairs = ()
 
 
 def build(

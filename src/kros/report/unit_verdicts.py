@@ -61,8 +61,7 @@ def with_verdict(row: Record) -> Record:
     verdict = Verdict.PASS if row["status"] == Status.OK and passed else Verdict.UNDECIDED
     beyond = not _within(row, OUTLIER.failed) and row["units"] >= FEWEST_UNITS
     verdict = Verdict.FAIL if row["outlier"] or beyond else verdict
-    row = row | {"verdict": verdict}
-    return row | {"reason": "; ".join(_reasons(row))}
+    return row | {"verdict": verdict, "reason": "; ".join(_reasons(row))}
 
 
 def _within(row: Record, factor: float = 1.0) -> bool:

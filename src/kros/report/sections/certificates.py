@@ -40,9 +40,9 @@ def certificates(facts: Facts) -> Section | None:
         return None
     assumed = facts.entry.get("assumptions")
     more = [f"“{facts.label}” at run time: {'; '.join(assumed)}."] if assumed else []
-    lists = [("Assumptions", [*_ASSUMED, *more]), ("How it is verified", _RECOMPUTED)]
+    card = [("Assumptions", [*_ASSUMED, *more]), ("How it is verified", _RECOMPUTED)]
     tables = [_table(facts), _reasons(facts.observers)]
-    return Section("certificates", "Certificates", [_TEXT], tables=tables, lists=lists)
+    return Section("certificates", "Certificates", [_TEXT], card, tables)
 
 
 def _table(facts: Facts) -> Table | None:

@@ -59,12 +59,11 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
     check_recordings(with_gaps(population))
-    watched, errors = Rows(), dict[tuple[str, str], Rows]()
+    errors = dict[tuple[str, str], Rows]()
     if observer is not None:
         recordings = FieldRecordings.open(context, data)
-        watched = monitored(recordings)
         if any(name not in population.states for name in observer.recorded):
-            return watched
+            return monitored(recordings)
         check_channels(population, observer)
         errors = errors_beside_bounds(context, population, recordings.values)
     if not names:
@@ -80,16 +79,13 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
             f"Checking {data}: the recordings have the conditions {there}, and the run has models of {modelled} alone; "
             "name the condition, as in the study."
         )
-    levels = {(r["unit"], r["condition"]): {k: r[k] for k in r if k.startswith("level_")} for r in watched}
     rows = Rows()
     with open_executor(workers) as executor:
         for name, models in known.items():
             outliers = OutlierModel.load(store.path("outliers", name))
             rows += score_condition(context, population, models, outliers, executor, same_unit)
     for row in rows:
-        place = row["unit"], row["condition"]
-        row |= levels.get(place, {})
-        if beside := errors.get(place):
+        if beside := errors.get((row["unit"], row["condition"])):
             row["error"] = max(beside, key=itemgetter("ratio"))
             gains = {e["state"]: e["gain_percent"] for e in beside}
             row["detectable"] = {s: min(p, gains.get(s, np.inf)) for s, p in row["detectable"].items()}
@@ -183,7 +179,7 @@ def score_condition(
 
 
 def monitored(recordings: FieldRecordings) -> Rows:
-    """Return a row for every unit and condition, as `check_units` does; what needs hidden channels is unknown."""
+    """Return a row for every unit and condition whose hidden channels were not recorded: the monitor's level decides."""
     population, observer, rows = recordings.population, recordings.observer, Rows()
     missing = [name for name in observer.recorded if name not in population.states]
     monitor = observer.monitor

@@ -141,7 +141,7 @@ class Campaign:
 def manifest(folder: Path) -> dict[str, Any]:
     """Return what a run's manifest says of its stages."""
     path = folder / "manifest.json"
-    found = json.loads(path.read_text()) if path.exists() else {}
+    found = json.loads(path.read_text())["artefacts"] if path.exists() else {}
     return {stage: found[stage] for stage in STAGES if stage in found}
 
 

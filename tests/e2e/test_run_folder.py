@@ -68,7 +68,7 @@ def again(kros: Callable[..., Any], fast: Path, run: Path, *options: Any) -> Any
 
 
 def digest(run: Path, stage: str) -> str:
-    return json.loads((run / "manifest.json").read_text())[stage]["digest"]
+    return json.loads((run / "manifest.json").read_text())["artefacts"][stage]["digest"]
 
 
 def test_manifests_list_every_file_of_a_run_and_no_other(finished):
@@ -80,7 +80,7 @@ def test_manifests_list_every_file_of_a_run_and_no_other(finished):
 
 def test_the_store_holds_what_manifests_name_and_no_other(finished):
     manifests = [json.loads(path.read_text()) for path in finished.rglob("manifest.json")]
-    named = {about["digest"] for manifest in manifests for key, about in manifest.items() if key != "checksum"}
+    named = {about["digest"] for manifest in manifests for about in manifest["artefacts"].values()}
     folders = {path.name for path in (finished / "store").iterdir() if path.is_dir()}
     assert folders == named
     results = {
@@ -155,8 +155,8 @@ def crafted(run: Path, names: list[str], matching: Path | None = None) -> None:
     path = run / "manifest.json"
     manifest = {key: about for key, about in json.loads(path.read_text()).items() if key != "checksum"}
     content = hashlib.sha256(matching.read_bytes()).hexdigest() if matching else "0" * 64
-    manifest["synthesize"]["files"] |= dict.fromkeys(names, (content, 0, 0))
-    manifest["synthesize"]["digest"] = "0" * 64
+    manifest["artefacts"]["synthesize"]["files"] |= dict.fromkeys(names, (content, 0, 0))
+    manifest["artefacts"]["synthesize"]["digest"] = "0" * 64
     path.write_text(json.dumps(manifest))
 
 

@@ -10,34 +10,41 @@ A digest is of settings, inputs and source, so what is there need not be compute
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat
 
-from ..core import ConfigError, DataError, Names, Settings, is_file, stamp_of
-from ..core.artifacts import CHECKSUM, check_checksum, file_digest, read_json, with_checksum, write_json
+from ..core import DataError, Names, Storable, frozen, is_file, stamp_of
+from ..core.artifacts import file_digest
 
-MANIFEST, INDEX = "manifest.json", "artefact.json"
+MANIFEST = "manifest.json"
 Described = tuple[str, int, int]  # SHA-256, size in bytes, time of the last change in ns
 
 
-class Artefact(Settings):
+@dataclass(frozen=True)
+class Artefact(Storable):
     """Files that follow from what `digest` is of."""
 
-    digest: str = Field(pattern="^[0-9a-f]{64}$")
+    KIND = "artefact"
+    digest: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     seconds: NonNegativeFloat = 0.0  # that it took
-    files: dict[str, Described] = Field(default_factory=dict)  # by name
+    files: dict[str, Described] = field(default_factory=dict)  # by name
     results: Names = ()  # digests of the results that it was computed from
-
-    @classmethod
-    def read(cls, path: Path) -> Artefact:
-        """Read one that was written as JSON."""
-        return cls.of(_checked(path), f"Artefact {path}")
 
     def matches(self, folder: Path, name: str) -> bool:
         """Return whether a file is in a folder as it was written; one with its size and time is not read."""
         path, (content, *stamp) = place(folder, name), self.files[name]
         return is_file(path) and (stamp_of(path) == tuple(stamp) or file_digest(path) == content)
+
+
+@frozen
+class Manifest(Storable):
+    """The artefacts of a run by stage; what they were computed from stands in the store."""
+
+    KIND = "manifest"
+    artefacts: dict[str, Artefact]
 
 
 def describe(path: Path) -> Described:
@@ -61,26 +68,12 @@ def place(folder: Path, name: str) -> Path:
 
 def read_manifest(folder: Path) -> dict[str, Artefact]:
     """Return the artefacts of a run by stage; none where there is no manifest."""
-    path = folder / MANIFEST
-    if not is_file(path):
-        return {}
-    try:
-        return {stage: Artefact.of(content, stage) for stage, content in _checked(path).items()}
-    except (ConfigError, DataError, AttributeError, TypeError) as error:
-        raise DataError(
-            f"Manifest {path}: is damaged, or of another version of kros ({error}); run the study again."
-        ) from error
-
-
-def _checked(path: Path) -> Mapping[str, object]:
-    content = read_json(path)
-    check_checksum(content, path)
-    return {key: value for key, value in content.items() if key != CHECKSUM}
+    return Manifest.load(folder).artefacts if is_file(folder / MANIFEST) else {}
 
 
 def write_manifest(folder: Path, artefacts: Mapping[str, Artefact]) -> None:
-    """Write which artefacts a run has; what they were computed from stands in the store."""
-    write_json(folder / MANIFEST, with_checksum({s: a.model_dump(exclude={"results"}) for s, a in artefacts.items()}))
+    """Write which artefacts a run has."""
+    Manifest({stage: replace(artefact, results=()) for stage, artefact in artefacts.items()}).save(folder)
 
 
 def recorded_files(folder: Path) -> frozenset[str]:

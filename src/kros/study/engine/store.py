@@ -21,9 +21,9 @@ from hashlib import sha256
 from pathlib import Path
 
 from ...core import ConfigError, DataError, DimensionError, Record, frozen
-from ...core.artifacts import as_written, digest_of, file_digest, read_json, with_checksum, write_json
+from ...core.artifacts import as_written, digest_of, file_digest, read_json, write_json
 from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy
-from ...report.manifest import INDEX, MANIFEST, Artefact, describe, place, read_manifest, recorded_files, write_manifest
+from ...report.manifest import MANIFEST, Artefact, describe, place, read_manifest, recorded_files, write_manifest
 from ..config import Stage, StudyConfig, stored_config
 from .lock import NAME as LOCK
 from .lock import locked
@@ -100,9 +100,9 @@ class Store:
         """Return an artefact that is in the store, whole."""
         folder = self.artefacts / digest
         try:
-            artefact = Artefact.read(folder / INDEX)
+            artefact = Artefact.load(folder)
             whole = artefact.digest == digest and all(artefact.matches(folder, name) for name in artefact.files)
-        except (ConfigError, DataError, AttributeError, TypeError):
+        except DataError:
             return None
         return artefact if whole else None
 
@@ -118,8 +118,8 @@ class Store:
         draft.mkdir(exist_ok=True)
         paths = sorted(path for path in draft.rglob("*") if is_file(path))
         files = {path.relative_to(draft).as_posix(): describe(path) for path in paths}
-        artefact = Artefact(digest=digest, seconds=seconds, files=files, results=tuple(sorted(results)))
-        write_json(draft / INDEX, with_checksum(artefact.model_dump()))
+        artefact = Artefact(digest, seconds, files, tuple(sorted(results)))
+        artefact.save(draft)
         target = self.artefacts / digest
         if target.exists():
             target.replace(draft.with_name("earlier"))
@@ -128,10 +128,9 @@ class Store:
 
     def add(self, stage: str, artefact: Artefact) -> None:
         """Name an artefact of the store in the manifest, in place of an earlier one, and put its files into place."""
-        entry = artefact.model_copy(update={"results": ()})
-        if self.manifest.get(stage) != entry:
+        if self.manifest.get(stage) != replace(artefact, results=()):
             self.drop(stage)
-            write_manifest(self.folder, self.manifest | {stage: entry})
+            write_manifest(self.folder, self.manifest | {stage: artefact})
         for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
             self._link(self.artefacts / artefact.digest / name, place(self.folder, name))
 

@@ -74,10 +74,12 @@ def check_channels(population: Population, observer: Observer, *, hidden: bool =
     """Refuse other channels, units of measure or sampling periods than those of the run, perhaps of hidden states."""
     needed = (*(observer.recorded if hidden else observer.outputs), *observer.inputs)
     there = (*population.states, *population.inputs)
-    if (hidden and needed != there) or not set(needed) <= set(there):
+    missing = [name for name in needed if name not in there]
+    if missing or (hidden and needed != there):
+        problem = f"{', '.join(missing)} is missing" if missing else "they are others, or in another order"
         raise DataError(
-            f"Channels: the observer needs {', '.join(needed)}, the recordings have {', '.join(there)}; record what is "
-            "missing, or correct the mapping."
+            f"Channels: {problem}; the observer needs {', '.join(needed)}, the recordings have {', '.join(there)}; "
+            "record them, or correct the mapping."
         )
     units = observer.about.get("units_of_measure", {})
     for channel in population.channels:

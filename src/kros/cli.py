@@ -404,7 +404,7 @@ def figures(run_folder: Run, out: Path) -> None:
     """Write the report's figures as PNG and PDF."""
     from .study.stages.report import write_figures
 
-    _say([f"{len(write_figures(run_folder, out, _progress()))} figures in {out}"])
+    _say([f"{len(write_figures(run_folder, out))} figures in {out}"])
 
 
 @app.command()

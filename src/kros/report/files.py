@@ -5,12 +5,11 @@ from __future__ import annotations
 import io
 import logging
 import re
-import time
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from ..core import ConfigError, Progress, write_bytes
+from ..core import ConfigError, write_bytes
 from .canvas import Figure
 from .figures import FIGURES, draw
 from .run_folder import RunFolder
@@ -25,22 +24,19 @@ _COORDINATES = re.compile(r'(?<= )(?:d|x|y|transform)="[^"]*"')
 _BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")  # a hundredth of a point is enough
 
 
-def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
+def write_figures(run: Path, out: Path) -> list[str]:
     """Write every figure of a run as PNG and PDF to a folder; return the names of the files in their order."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
-    names, progress, began = [], progress or Progress(), time.perf_counter()
-    progress.start("figures", len(FIGURES))
+    names = []
     for name in FIGURES:
         drawn = draw(name, RunFolder(run))
-        progress.advance()
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)
             continue
         for suffix in _CHANGING:
             write_bytes(out / f"{drawn.name}.{suffix}", printed(drawn.figure, suffix))
             names.append(f"{drawn.name}.{suffix}")
-    progress.finish("figures", time.perf_counter() - began, skipped=False)
     return names
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from ...core import Progress
 from ..config import Stage
 from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
@@ -30,9 +29,9 @@ def render_run(folder: Path, workers: int) -> Path:
         return render(folder, context.store.metrics(), executor.map)
 
 
-def write_figures(folder: Path, out: Path, progress: Progress | None = None) -> list[str]:
+def write_figures(folder: Path, out: Path) -> list[str]:
     """Write the figures of a finished run as PNG and PDF."""
     from ...report import files
 
     with open_finished(folder):
-        return files.write_figures(folder, out, progress)
+        return files.write_figures(folder, out)

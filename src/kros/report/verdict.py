@@ -160,17 +160,9 @@ def _stopping(facts: Facts) -> Checks:
 
 
 def _of_recordings(facts: Facts) -> Checks:
-    """Yield alerts of the recordings, confounded conditions, and too short recordings."""
+    """Yield alerts of the recordings, and a spread that is noise."""
     for alert in facts.study.get("alerts", ()):
         yield f"Recordings: {alert.rstrip('.')}.", "Look at the recordings.", "recordings"
-    rows = [row for row in facts.get("units") if row.get("conditions") and row.get("group") != "outliers"]
-    inside = [row for row in rows if facts.study["identify_on"] in row["conditions"]]
-    if len(inside) < len(rows):
-        single = all(len(row["conditions"]) == 1 for row in rows)
-        text = "Units and conditions are confounded: every unit was recorded in one condition only. " if single else ""
-        text += f"Models and observers describe {len(inside)} of {len(rows)} units, those recorded in "
-        text += f"“{condition_label(facts.study['identify_on'])}”."
-        yield text, "Record all units in the same conditions.", "recordings"
     noise = facts.get("uncertainty").get(facts.model, {}).get("noise_share")
     if noise and noise["at_peak"] >= THRESHOLDS.noise:
         text = f"{100 * noise['at_peak']:.0f} % of the spread at {number(noise['peak_hz'])} Hz is estimation noise, "
@@ -191,7 +183,7 @@ def _of_units(facts: Facts) -> Checks:
         if few := [r for r in rows if r.get("status") == status]:
             yield _inconclusive(few, rows), action, "units"
     if remarks := [f"{r['unit']} ({r['status']})" for r in facts.get("units") if r.get("status", "ok") != "ok"]:
-        yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
+        yield f"Units with a remark: {some(remarks)}.", "Record all units in the same conditions.", "units"
     if unlike := units_of_large_errors(facts):
         text = f"Units with several times the error of the others: {some(unlike)}."
         action = "Inspect these units; leave them out if they are defective, since they make the observer worse."

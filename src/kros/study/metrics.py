@@ -6,7 +6,6 @@ What was not run is absent, what is unknown is null, nothing is invented.
 from __future__ import annotations
 
 from ..core import Record, load_artifact, plain
-from ..evaluate.over_units import interval_rows
 from ..observer.sensor_gains import sensor_gains
 from ..uncertainty import UncertainModel
 from .config import Stage
@@ -148,8 +147,8 @@ def _evaluation(context: Context, metrics: Record) -> Record:
     for name, errors in evaluated["free_run"].items():
         metrics["models"][name]["freerun_error_percent"] = errors
     metrics["observers"] |= evaluated["baselines"]
-    entries = {"evaluation": evaluated["rows"], "intervals": interval_rows(evaluated["rows"])}
-    return entries | load_metrics(context) | ({"recorded": evaluated["recorded"]} if evaluated["recorded"] else {})
+    errors = {key: evaluated[key] for key in ("evaluation", "intervals", "recorded") if key in evaluated}
+    return errors | load_metrics(context)
 
 
 _OF_STAGES = {

@@ -17,6 +17,7 @@ from ...design.baselines import Baseline, make_difference, make_extended, make_l
 from ...design.synthesize import measurement_noise
 from ...design.training import TrainingSet
 from ...evaluate.held_out import HeldOut, Outcome, alike
+from ...evaluate.over_units import interval_rows
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
 from ...observer.baselines.trained import Regressor
@@ -44,8 +45,10 @@ def run(context: Context) -> None:
     content |= {
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
         "band_hz": episodes.band_hz,
-        "recorded": episodes.rows("recorded", episodes.recorded(), roles) if population.truths else [],
+        "intervals": interval_rows(content["evaluation"]),
     }
+    if population.truths:
+        content["recorded"] = episodes.rows("recorded", episodes.recorded(), roles)
     save_artifact(context.store.draft("evaluation"), "evaluation", content)
     for number, key in enumerate(episodes.shown):
         shown = [{n: single(o.shown[key]) for n, o in of.items() if key in o.shown} for of in (results, free_runs)]
@@ -68,7 +71,7 @@ def judged(context: Context, episodes: HeldOut, roles: Mapping[str, str]) -> tup
         if facts.get("status") == "failed":
             log.info("%s could not be computed: %s", name, facts["reason"])
     rows = [row for item in outcomes.items() for row in episodes.rows(*item, roles)]
-    return outcomes, {"rows": rows, "baselines": baselines}
+    return outcomes, {"evaluation": rows, "baselines": baselines}
 
 
 def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> list[Outcome]:

@@ -79,7 +79,7 @@ def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> Record:
         "folds": folds,
         "errors": "empirical",  # of these units: folds share what they learn from, so nothing follows for the next one
         "failed": {str(number): fold["failed"] for number, fold in enumerate(results) if "failed" in fold},
-        "rows": [{"fold": number, **row} for number, fold in enumerate(results) for row in fold.get("rows", [])],
+        "rows": [{"fold": number, **row} for number, fold in enumerate(results) for row in fold.get("evaluation", [])],
         "observers": facts_of_folds([fold.get("observers", {}) for fold in results]),
     }
 
@@ -123,7 +123,7 @@ def next_unit(context: Context) -> Record:
     confidence, facts, population = context.config.evaluate.confidence, context.facts, context.population
     deployed, home = context.observers_record["deployed"], facts.identify_on
     rows, failed = reserve_rows(context, deployed)
-    known = [r for r in context.evaluation["rows"] if r["observer"] == deployed and r["unit"] in facts.pooled]
+    known = [r for r in context.evaluation["evaluation"] if r["observer"] == deployed and r["unit"] in facts.pooled]
     hidden = [c for c in population.states if c not in population.measured] or list(population.states)
     reserved, pooled = ([r for r in part if r["condition"] == home] for part in (rows, known))
     content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": confidence}

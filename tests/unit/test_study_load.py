@@ -14,7 +14,7 @@ from kros.plants import HarmonicDrivePopulation
 from kros.report.figures.load import load_torque
 from kros.study.config import LoadConfig
 from kros.study.engine.store import Store
-from kros.study.stages.load import load_metrics, require_load, run_load
+from kros.study.stages.load import require_load, run_load
 
 POPULATION = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=3.0, seed=0, loop="soft").simulate().population
 
@@ -48,8 +48,8 @@ def test_a_declared_load_is_found_on_the_other_units_with_the_parameters_of_the_
     study = context(tmp_path, moment=0.2, inertia=0.01, units=("001002",))
     study.lifting = Lifting(POPULATION.states, ("sin(100*position + phase)",), ("phase",))
     study.identified.parameters = {unit: {"phase": 0.5 + i} for i, unit in enumerate(POPULATION.unit_ids)}
-    run_load(study, {})
-    told = load_metrics(study)["load_torque"]
+    content = run_load(study, {})
+    told = content["load_torque"]
     assert told["known"] == ["001002"]
     assert [row["observer"] for row in told["rows"]] == ["koopman/load", "linear/load"]
     row = told["rows"][1]  # phases are made up here
@@ -59,15 +59,14 @@ def test_a_declared_load_is_found_on_the_other_units_with_the_parameters_of_the_
     assert linear.lifting.states[3] == "load"
     assert linear.seen is not None
     assert (koopman.parameters, linear.parameters) == ({"phase": 0.5}, {})
-    run = SimpleNamespace(folder=tmp_path, sample_period_s=1e-3, has=lambda name: (tmp_path / name).exists())
+    run = SimpleNamespace(folder=tmp_path, evaluation=content, has=lambda name: (tmp_path / name).exists())
     assert "linear/load" in load_torque(run)[1]
 
 
 def test_without_a_moment_nothing_is_done(tmp_path: Path) -> None:
     study = context(tmp_path)
-    run_load(study, {})
+    assert run_load(study, {}) == {}
     assert not list(tmp_path.iterdir())
-    assert load_metrics(study) == {}
 
 
 def test_a_study_says_what_its_load_lacks(tmp_path: Path) -> None:

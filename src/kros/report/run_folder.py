@@ -6,7 +6,7 @@ Only files in the records of the run count. What a run does not have raises `Not
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import field
 from functools import cached_property
 from pathlib import Path
@@ -145,10 +145,10 @@ class RunFolder:
         """Name of the deployed observer, where there is one."""
         return self._record("observers/observers.json").get("deployed")
 
-    @property
-    def band_hz(self) -> Sequence[float] | None:
-        """The band around the gearbox frequency at top speed, where there is one."""
-        return self._record("evaluation/evaluation.json").get("band_hz")
+    @cached_property
+    def evaluation(self) -> Record:
+        """Errors of all observers and models."""
+        return self._record("evaluation/evaluation.json")
 
     @cached_property
     def shown(self) -> list[Shown]:

@@ -12,7 +12,6 @@ from .config import Stage
 from .engine.context import Context
 from .engine.store import Store
 from .stages import left_out
-from .stages.load import load_metrics
 
 
 def collect_metrics(context: Context, until: Stage) -> Record:
@@ -147,8 +146,7 @@ def _evaluation(context: Context, metrics: Record) -> Record:
     for name, errors in evaluated["free_run"].items():
         metrics["models"][name]["freerun_error_percent"] = errors
     metrics["observers"] |= evaluated["baselines"]
-    errors = {key: evaluated[key] for key in ("evaluation", "intervals", "recorded") if key in evaluated}
-    return errors | load_metrics(context)
+    return {key: evaluated[key] for key in ("evaluation", "intervals", "recorded", "load_torque") if key in evaluated}
 
 
 _OF_STAGES = {

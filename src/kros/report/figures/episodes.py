@@ -110,8 +110,9 @@ def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> Captioned:
     """Return the figure of some episodes of a run and its caption; enlarged are some turns of the gearbox, or less."""
     blocks = [replace(block, states=block.states[: DRAWING.states]) for block in blocks]
     size = DRAWING.zoom if run.has("calibration/calibration.json") else len(run.shown[0].states) // 8
-    text += " Shaded: the band around the gearbox frequency at top speed." if run.band_hz else ""
-    return blocks_figure(run.channels, blocks, size, run.band_hz), text
+    band_hz = run.evaluation["band_hz"]
+    text += " Shaded: the band around the gearbox frequency at top speed." if band_hz else ""
+    return blocks_figure(run.channels, blocks, size, band_hz), text
 
 
 def blocks_figure(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ...core import load_artifact
 from ...data import Channel, Role
 from ..canvas import Captioned
 from ..names import in_condition, model_label, model_look
@@ -14,9 +13,9 @@ _WAYS = {"load": "load state", "current": "error of the recorded current"}
 
 def load_torque(run: RunFolder) -> Captioned:
     """Draw estimates of the load on an episode, a row a way to estimate."""
-    if not run.has("load/load.json"):
+    if not run.has("load/shown.json"):
         raise NotShownError("this study declares no load; set load.moment")
-    rows, shown = load_artifact(run.folder / "load", "load")[0]["rows"], Shown.load(run.folder / "load" / "shown")
+    rows, shown = run.evaluation["load_torque"]["rows"], Shown.load(run.folder / "load")
     blocks = []
     for way, label in _WAYS.items():
         estimates = {n: values for n, values in shown.observers.items() if n.endswith(f"/{way}")}

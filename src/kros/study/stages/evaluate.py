@@ -47,6 +47,7 @@ def run(context: Context) -> None:
         "band_hz": episodes.band_hz,
         "intervals": interval_rows(content["evaluation"]),
     }
+    content |= run_load(context, load_observers(context))
     if population.truths:
         content["recorded"] = episodes.rows("recorded", episodes.recorded(), roles)
     save_artifact(context.store.draft("evaluation"), "evaluation", content)
@@ -55,7 +56,6 @@ def run(context: Context) -> None:
         states, inputs = map(single, population.read_parts(key))
         one = Shown(key, population.sample_period_s, states, inputs, *shown)
         one.save(context.store.draft("evaluation", "shown", str(number)))
-    run_load(context, load_observers(context))
 
 
 def judged(context: Context, episodes: HeldOut, roles: Mapping[str, str]) -> tuple[dict[str, Outcome], Record]:

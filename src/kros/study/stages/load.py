@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from ...core import Array, ConfigError, KrosError, Record, frozen, load_artifact, save_artifact
+from ...core import Array, ConfigError, KrosError, Record, frozen
 from ...data import EpisodeBatch, Population, some
 from ...design.training import seen_by
 from ...evaluate.sensor import as_arriving
@@ -57,10 +57,10 @@ def require_load(config: LoadConfig, population: Population) -> None:
         raise ConfigError(f"load: there is no unit or state {missing[0]!r} in {there}; correct the name.")
 
 
-def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
-    """Make and judge the estimators of the load, and save them with their errors; nothing without a declared load."""
+def run_load(context: Context, observers: Mapping[str, Observer]) -> Record:
+    """Make and judge the estimators of the load, save them, and return errors; nothing without a declared load."""
     if context.config.load.moment is None:
-        return
+        return {}
     trial, liftings = LoadTrial.of(context), {"linear": Lifting(context.population.states)}
     if context.lifting.functions:
         liftings = {"koopman": context.lifting, **liftings}
@@ -76,27 +76,16 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
             log.info("%s could not be computed: %s", name, error)
         facts[name] = fact
     shown = next(i for i, key in enumerate(trial.test.keys) if key.condition == TRIAL.condition)
-    content = {
-        "known": trial.known,
-        "rows": [trial.row(*item) for item in curves.items()],
-        "observers": facts,
-        "corner_hz": TRIAL.judged_hz,
-        "settle_s": TRIAL.settle_s,
-    }
-    save_artifact(context.store.draft(LOAD), LOAD, content)
-    signals = trial.truth[1][:, [shown]], trial.test.inputs[:, shown]
-    single = Shown(
-        trial.test.keys[shown], trial.test.sample_period_s, *signals, {n: v[:, [shown]] for n, v in curves.items()}
+    key, dt, estimates = (
+        trial.test.keys[shown],
+        trial.test.sample_period_s,
+        {n: v[:, [shown]] for n, v in curves.items()},
     )
-    single.save(context.store.draft(LOAD, "shown"))
-
-
-def load_metrics(context: Context) -> Record:
-    """Return what `metrics.json` says of the load; nothing where the study declares none."""
-    if context.config.load.moment is None:
-        return {}
-    content = load_artifact(context.store.path(LOAD), LOAD)[0]
-    return {"load_torque": {key: content[key] for key in ("known", "corner_hz", "settle_s", "observers", "rows")}}
+    one = Shown(key, dt, trial.truth[1][:, [shown]], trial.test.inputs[:, shown], estimates)
+    one.save(context.store.draft(LOAD))
+    rows = [trial.row(*item) for item in curves.items()]
+    settings = {"corner_hz": TRIAL.judged_hz, "settle_s": TRIAL.settle_s}
+    return {"load_torque": {"known": trial.known, "rows": rows, "observers": facts, **settings}}
 
 
 def _with_load(trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, Record]:

@@ -24,13 +24,12 @@ _CELL = ("condition", "observer", "channel")
 
 @frozen
 class ErrorCell:
-    """Error of an observer in a channel, percent of the largest value; None where an estimate diverged."""
+    """Error of an observer in a channel, percent of the largest value; unknown where an estimate diverged."""
 
     means: Mapping[str, float] = field(default_factory=dict)  # over units, of what all have, by its key in the metrics
     errors: Mapping[str, float] = field(default_factory=dict)  # by unit
     rms: Mapping[str, float] = field(default_factory=dict)  # by unit, in the channel's unit of measure
     interval: Sequence[float] = ()  # 95 % interval of the mean, by a bootstrap over units
-    diverged: int = 0  # units whose estimate diverged
 
     @property
     def worst_unit(self) -> str | None:
@@ -53,9 +52,9 @@ class ErrorCell:
         return self.means.get("error_percent")
 
     @property
-    def shown(self) -> float | str | None:
+    def shown(self) -> float | str:
         """Mean error as tables show it."""
-        return "diverged" if self.diverged else self.mean
+        return "diverged" if self.mean is None else self.mean
 
 
 @frozen
@@ -82,9 +81,8 @@ class ErrorTable:
 
 def _cell(rows: Sequence[Any], interval: Sequence[float]) -> ErrorCell:
     """Summarise the units of one observer and channel."""
-    lost = len({r["unit"] for r in rows if r["error_percent"] is None})
-    if lost:
-        return ErrorCell(diverged=lost)
+    if any(r["error_percent"] is None for r in rows):
+        return ErrorCell()
     numbers = (key for key, value in rows[0].items() if not isinstance(value, str))
     known = {key: values for key in numbers if None not in (values := [r.get(key) for r in rows])}
     means = {key: float(np.mean(values)) for key, values in known.items()}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from enum import Enum
+from math import inf
 from operator import itemgetter
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from ..core import TINY, ByName, frozen, grouped
 from ..data import some
 from ..design.task import split_name
-from .facts import ErrorCell, ErrorTable, Facts
+from .facts import ErrorCell, Facts
 from .names import condition_label, in_condition, joined, label_of, number, observer_label, words
 
 Checks = Iterator[tuple[str, str, str]]  # what is wrong, what to do, and the section with the details
@@ -123,15 +124,15 @@ def _numbers(facts: Facts) -> list[Number]:
 
 def _elsewhere(facts: Facts, channel: str) -> list[str]:
     """Return the mean error in the worst condition, if this is not that of the models."""
-    worst, cell = _worst(facts, channel)
-    error = "diverged" if cell.diverged else f"{number(cell.mean)} %"
+    worst, mean = _worst(facts, channel)
+    error = "diverged" if mean == inf else f"{number(mean)} %"
     return [] if worst == facts.table.condition else [f"{condition_label(worst) or worst}: {error}"]
 
 
-def _worst(facts: Facts, channel: str) -> tuple[str, ErrorCell]:
+def _worst(facts: Facts, channel: str) -> tuple[str, float]:
     """Return the condition in which the deployed observer's error of a channel is largest, and the error."""
-    cells = {t.condition: t.cells.get(facts.deployed, {}).get(channel, ErrorCell()) for t in facts.tables}
-    return max(cells.items(), key=lambda item: (item[1].diverged, item[1].mean or 0.0))
+    known = [table for table in facts.tables if facts.deployed in table.cells]
+    return max(((t.condition, t.mean(facts.deployed, [channel])) for t in known), key=itemgetter(1))
 
 
 def _lag(lag_s: float | None) -> str:
@@ -146,14 +147,14 @@ def _stopping(facts: Facts) -> Checks:
     hidden = facts.hidden
     if not facts.cells:
         yield "The run stopped before an observer was designed and evaluated.", "Run it to its end.", "run"
-    elif any(facts.cells[c].mean is None or _worst(facts, c)[1].diverged for c in hidden):
+    elif any(_worst(facts, c)[1] == inf for c in hidden):
         text = f"The estimates of “{facts.label}” diverge on held-out episodes."
         yield text, "Do not use it; look at the models first.", "models"
     elif hidden and not_improved(facts) == hidden:
         text = f"“{facts.label}” is no better than its model without correction."
         yield text, f"Measure a signal that depends more on {channels(hidden)}.", "errors"
     left_out = facts.tables_of(facts.get("left_out").get("rows", ()))
-    lost = [c for table in left_out[:1] for c, cell in table.cells.get(facts.deployed, {}).items() if cell.diverged]
+    lost = [c for table in left_out[:1] for c, cell in table.cells.get(facts.deployed, {}).items() if cell.mean is None]
     if set(lost) - set(facts.measured):
         text = "Designed without the unit that it runs on, this kind of observer diverges on some units."
         yield text, "Do not use it on new units.", "left-out"
@@ -215,9 +216,10 @@ def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
 
 def _of_errors(facts: Facts) -> Checks:
     """Yield better observers, channels without improvement, and bounds that errors exceed."""
-    table, hidden, ratio = facts.table, facts.hidden, 1 - THRESHOLDS.better
-    better = {n: [c for c in hidden if _smaller(table, n, facts.deployed, c, ratio)] for n in table.cells}
-    ranked = sorted(better, key=lambda name: (-len(better[name]), table.mean(name, better[name])))
+    hidden, mean, ratio = facts.hidden, facts.table.mean, 1 - THRESHOLDS.better
+    limits = {c: ratio * mean(facts.deployed, [c]) for c in hidden}
+    better = {n: [c for c in hidden if mean(n, [c]) < limits[c]] for n in facts.table.cells}
+    ranked = sorted(better, key=lambda name: (-len(better[name]), mean(name, better[name])))
     best = [name for c in hidden for name in [n for n in ranked if c in better[n]][:1]]
     for name in dict.fromkeys(best):
         where = "in all hidden channels" if better[name] == hidden else f"of {channels(better[name])}"
@@ -229,7 +231,7 @@ def _of_errors(facts: Facts) -> Checks:
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."
         yield text, "Do not rely on the estimate more than on the model.", "errors"
-    if large := {c: e for c in hidden if (e := _worst(facts, c)[1].mean or 0.0) > 100 * THRESHOLDS.large}:
+    if large := {c: e for c in hidden if inf > (e := _worst(facts, c)[1]) > 100 * THRESHOLDS.large}:
         each = joined([f"{words(c)} ({number(e)} % of the largest value)" for c, e in large.items()])
         yield f"The error is large: {each}.", "Measure another signal, or use the estimate for trends alone.", "errors"
     for channel, bound in (facts.entry.get("set_bound") or {}).items():
@@ -309,15 +311,7 @@ def voids(facts: Facts) -> list[str]:
 
 def not_improved(facts: Facts) -> list[str]:
     """Return the hidden channels in which the deployed observer is no better than its model without correction."""
-    other, ratio = f"{facts.model}/open_loop", 1 - THRESHOLDS.improved
+    other, ratio, mean = f"{facts.model}/open_loop", 1 - THRESHOLDS.improved, facts.table.mean
     if facts.deployed == other or other not in facts.table.cells:
         return []
-    return [c for c in facts.hidden if not _smaller(facts.table, facts.deployed, other, c, ratio)]
-
-
-def _smaller(table: ErrorTable, one: str, other: str, channel: str, ratio: float) -> bool:
-    """Tell whether the mean error of one observer in a channel is below a ratio of another's, which may diverge."""
-    if not all(channel in table.cells[name] for name in (one, other)):
-        return False
-    error, rival = (table.cells[name][channel].mean for name in (one, other))
-    return error is not None and (rival is None or error < ratio * rival)
+    return [c for c in facts.hidden if not mean(facts.deployed, [c]) < ratio * mean(other, [c])]

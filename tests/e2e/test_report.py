@@ -23,7 +23,7 @@ from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace
 from kros.report.figures import FIGURES, draw
 from kros.report.figures.entries import entry_names
-from kros.report.figures.synthesis import scaled_filter
+from kros.report.figures.responses import scaled_filter
 from kros.report.figures.uncertainty import published_bounds
 from kros.report.files import write_figures
 from kros.report.html import render

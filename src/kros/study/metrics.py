@@ -13,6 +13,8 @@ from .engine.context import Context
 from .engine.store import Store
 from .stages import left_out
 
+_PARTS = {"train": "train", "held_out": "test"}  # of the episodes
+
 
 def collect_metrics(context: Context, until: Stage) -> Record:
     """Collect the metrics of all stages up to one."""
@@ -31,7 +33,6 @@ def collect_metrics(context: Context, until: Stage) -> Record:
 
 def _study(context: Context, done: list[Stage]) -> Record:
     facts, population = context.facts, context.population
-    parts = {"train": facts.train, "held_out": facts.test}
     study: Record = {
         "units": len(facts.pooled),
         "conditions": population.conditions,
@@ -41,14 +42,14 @@ def _study(context: Context, done: list[Stage]) -> Record:
         "measured": [c.name for c in population.channels if c.measured],
         "inputs": list(population.inputs),
         "episodes": {
-            condition: {part: sum(key.condition == condition for key in keys) for part, keys in parts.items()}
+            condition: {part: len(facts.keys(of, condition=condition)) for part, of in _PARTS.items()}
             for condition in population.conditions
         },
         "resolution": facts.resolution,
         "dropped": facts.dropped,
+        "sensor": {name: one.model_dump(exclude_none=True) for name, one in context.config.sensor.items()},
+        "alerts": facts.alerts,
     }
-    sensor = {name: one.model_dump(exclude_none=True) for name, one in context.config.sensor.items()}
-    study |= {name: value for name, value in (("sensor", sensor), ("alerts", facts.alerts)) if value}
     if Stage.IDENTIFY in done:
         study["alpha"] = context.identified.models(context.identified.edmd_kinds[0]).alpha
     return study | ({"deployed": context.observers_record["deployed"]} if Stage.SYNTHESIZE in done else {})
@@ -59,9 +60,7 @@ def _units(context: Context, done: list[Stage]) -> list[Record]:
     calibration = context.calibration if Stage.CALIBRATE in done else None
     models = context.identified.models() if Stage.IDENTIFY in done else None
     for unit, group in facts.groups.items():
-        keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
-        conditions = list(dict.fromkeys(k.condition for k in keys))
-        row: Record = {"unit": unit, "group": group, "conditions": conditions, "status": "ok"}
+        row: Record = {"unit": unit, "group": group, "status": "ok"}
         if calibration is not None:
             phase = calibration.units.get(unit)
             row |= {name: getattr(phase, name, None) for name in ("phase_rad", "concentration")}
@@ -133,7 +132,6 @@ def _deployment(context: Context) -> Record:
         "largest": {name: sizes[name] for name in (*measured, *observer.inputs)},
         "delay_samples": observer.runtime.delay,
         "parameters": {name: observer.parameters.get(name) for name in observer.lifting.parameters},
-        "functions": observer.lifting.functions,
         "states": observer.lifting.n_states + observer.controller.n_states,
         "sensor": observer.about["sensor"],
         "sensor_gains": sensor_gains(observer, sizes),

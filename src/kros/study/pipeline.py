@@ -20,7 +20,6 @@ from .config import Stage, StudyConfig, load_config, validate_config
 from .engine.context import Context, StageStep, run_steps
 from .engine.executors import open_executor
 from .engine.store import METRICS, Store, open_run, require_own
-from .engine.store import load_run as load_run  # where readers of runs look for it
 from .metrics import collect_metrics
 from .stages import evaluate, learning, left_out, report
 from .stages.learning import LEARNING

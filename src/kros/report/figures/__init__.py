@@ -28,12 +28,14 @@ FIGURES: dict[str, Row] = {
     "signals": Row("Recorded signals", "recordings:signals", "One held-out episode as recorded."),
     "tracking_spectrum": Row("Tracking error", "recordings:tracking_spectrum", "Peaks are the modelled disturbance."),
     "phase": Row("Phase calibration", "recordings:phase", "Lags should be nearly equal, concentrations near one."),
-    "models": Row("Models of all units", "models:bode", "The uncertain model has to bound the spread of the lines."),
+    "models": Row(
+        "Models of all units", "responses:models", "The uncertain model has to bound the spread of the lines."
+    ),
     "free_run": Row("Simulation of the models", "episodes:free_run", "The smaller the error, the better the model."),
     "forms": Row("Six uncertainty forms", "uncertainty:forms", "Units differ least in the form with the lowest line."),
     "weights": Row("Weights and optimal bounds", "uncertainty:weights", "Lines should lie close to their shade."),
     "weights_entrywise": Row("Weights, entry by entry", "uncertainty:weights_entrywise", "Black bounds blue lines."),
-    "synthesis": Row("Plant, weights and filters", "synthesis:bode", "High weights need a large correction."),
+    "synthesis": Row("Plant, weights and filters", "responses:filters", "High weights need a large correction."),
     "observers_in_time": Row("Estimates", "episodes:estimates", _SMALL),
     "observers_in_time_paper": Row("The paper's estimates", "episodes:paper_estimates", _SMALL),
     "loaded_paper": Row("Errors in another condition", "episodes:other_condition", _SMALL),
@@ -85,11 +87,8 @@ def run_figure(run: Any, name: str = "observers_in_time") -> Figure:
 _ESTIMATES = {"estimates": "episodes:design_figure"}
 PLOTS: dict[str, dict[str, str]] = {
     "Population": {"recorded": "recordings:population_figure"},
-    "ModelSet": {"bode": "models:bode_figure"},
-    "IdentifiedModels": {
-        "bode": "models:identified_bode",
-        "compare": "episodes:compare_figure",
-    },
+    "ModelSet": {"bode": "responses:bode_figure"},
+    "IdentifiedModels": {"bode": "responses:identified_bode", "compare": "episodes:compare_figure"},
     "UncertainModel": {"weights": "uncertainty:uncertain_figure"},
     "UncertainModels": {"weights": "uncertainty:sets_figure"},
     "Design": _ESTIMATES,

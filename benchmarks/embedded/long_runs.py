@@ -30,7 +30,6 @@ from kros.observer import Observer
 from kros.observer.screen import screened
 from kros.observer.simulate import Course, run_observers
 from kros.observer.tracking import PhaseLockedLoop
-from kros.study.config import Stage
 from kros.study.engine.context import open_finished
 from kros.study.stages.learning import open_source
 
@@ -70,7 +69,7 @@ def main() -> None:
 
 def read(run: Path) -> tuple[dict[str, tuple[Observer, str | None]], HeldOut]:
     """Return the observers of a run with variants of the deployed one, and its held-out recordings."""
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
+    with open_finished(run) as context:
         config, store = context.config, context.store
         paths = sorted(p for p in store.path("observers").glob("*/*.json"))
         kinds: dict[str, tuple[Observer, str | None]] = {

@@ -30,7 +30,7 @@ from ...uncertainty.outliers.score import FEWEST_UNITS, Status
 from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
 from ..engine.store import DEPLOYED
-from .field import STAGES, FieldRecordings, check_channels, hidden_states, open_data, status_counts
+from .field import FieldRecordings, check_channels, hidden_states, open_data, status_counts
 
 log = logging.getLogger(__name__)
 Judged = list[tuple[Array, Flags]]  # innovations, and which samples are judged
@@ -41,7 +41,7 @@ def check_units(run: Path, data: Path, workers: int, same_unit: bool) -> Rows:
 
     A name of a unit of the study is refused for other recordings, unless `same_unit` says it is the same machine.
     """
-    with open_finished(run, *STAGES) as context:
+    with open_finished(run) as context:
         return verdicts(context, data, workers, same_unit)
 
 

@@ -12,7 +12,6 @@ from ...core import ConfigError, Record
 from ...data import EpisodeKey
 from ...export.estimates import ENDINGS, writer
 from ...observer import recorded_channel, recorded_factors
-from ..config import Stage
 from ..engine.context import open_finished
 from .field import FieldRecordings, status_counts
 
@@ -25,7 +24,7 @@ def estimate_recordings(
     The band is the bound of the RMS error for recorded signals, where the observer has one and the sample is good, and
     so were `settle_samples` before it.
     """
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
+    with open_finished(run) as context:
         if out.exists() or out.suffix not in ENDINGS:
             raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
         recordings = FieldRecordings.open(context, data, given, track)

@@ -13,7 +13,6 @@ from ...evaluate.sensor import Arriving, arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
 from ...loops.compiler import find_compiler
 from ...observer import Observer, recorded_factors, run_observer
-from ..config import Stage
 from ..engine.context import Context, open_finished
 from ..stages.learning import open_source
 from ..stages.load import TRIAL, angle_load
@@ -39,7 +38,7 @@ def export_run(
 
     `name` is the study's by default.
     """
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as context:
+    with open_finished(run) as context:
         chosen, name = load_observer(context, observer), name or identifier(context.config.name)
         if fmi is not None:
             path, compared = export_fmu(chosen, out, fmi, name, precision, track), ""

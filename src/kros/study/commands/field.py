@@ -31,7 +31,7 @@ from ...observer import Observer, SampleStatus
 from ...observer.monitor import Watch
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
-from ..config import Stage, StudyConfig, validate_config
+from ..config import StudyConfig, validate_config
 from ..engine.context import Context
 from ..engine.store import DEPLOYED
 from ..stages.learning import ARRAYS
@@ -40,7 +40,6 @@ from ..stages.load import LOAD
 log = logging.getLogger(__name__)
 # Episode, first sample, estimates and the tracked parameter, bits, what was recorded: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits, Array]
-STAGES = (Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE)  # behind observers and scores
 _BLOCK = 20_000  # samples of an episode that are run at once
 _PHASES = 24  # values that are tried, around the circle
 _BATCH = 20  # shorter episodes that run side by side

@@ -22,7 +22,6 @@ from ..engine.context import Context, open_finished
 from ..engine.lock import locked
 from ..engine.store import Store, load_run
 from .check import verdicts
-from .field import STAGES
 
 REFUSED = "refused"  # in place of a verdict
 Waiting = dict[Path, Path]  # recordings, a file or a folder of Parquet, by where their results will be
@@ -41,7 +40,7 @@ def watch(folder: Path, run: Path, out: Path | None, every_s: float, once: bool)
         Store(out).tidy()
         while (now := waiting(folder, out)) or not once:
             if rest := {place: path for place, path in now.items() if place in before}:
-                with open_finished(run, *STAGES) as context:
+                with open_finished(run) as context:
                     units = by_unit(context, folder)
                     for place, path in rest.items():
                         yield from judged(context, path, place, folder, out, units.get(path, []))

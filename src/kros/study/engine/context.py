@@ -88,12 +88,12 @@ class Context:
 
 
 @contextmanager
-def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[Context]:
-    """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
+def open_finished(folder: Path, alone: bool = False) -> Iterator[Context]:
+    """Open a run for reading while no other process writes there, and its files are as they were written."""
     load_run(folder)
     with locked(folder, shared=not alone):
         config, store = load_run(folder)
-        store.verify(*stages)
+        store.verify()
         yield Context(config, store, Work())
 
 

@@ -85,11 +85,10 @@ class Store:
             raise DataError(f"Run: {self.path(METRICS)} holds no metrics; run the study again.")
         return content
 
-    def verify(self, *stages: str) -> None:
-        """Make sure that what some finished stages wrote is as they left it, by default all but the report."""
+    def verify(self) -> None:
+        """Make sure that what finished stages wrote is as they left it, but for the report, which is written again."""
         for stage, artefact in read_manifest(self.folder).items():
-            wanted = stage in stages if stages else stage != Stage.REPORT  # `kros report` writes it again
-            for name in artefact.files if wanted else ():
+            for name in artefact.files if stage != Stage.REPORT else ():
                 if not artefact.matches(self.folder, name):
                     reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
                     raise DataError(

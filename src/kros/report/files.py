@@ -50,7 +50,6 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
     metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     text = _encode(figure, "svg", transparent=True, metadata=metadata).decode()
     text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", text)
     opening = rf'<svg viewBox="\1" role="img" aria-label="{escape(title)}" xmlns:xlink="http://www.w3.org/1999/xlink">'

@@ -11,13 +11,12 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
-from ...core import ByName, KrosError, frozen
-from ...identify import Factor, ModelSet
+from ...core import Array, ByName, KrosError, frozen
+from ...identify import ModelSet
 from ...identify.edmd import bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
 from ...uncertainty import Form, UncertainModel, choose_nominal, residual
@@ -71,30 +70,26 @@ def _noise(context: Context, models: ModelSet, uncertain: UncertainModel) -> Cal
     """Return work that compares variation and noise of EDMD models of some units, the nominal one among them."""
     units = uncertain.unit_ids
     chosen = [units[k] for k in np.union1d(evenly(len(units), DEFAULT.units), [uncertain.nominal])]
-    recorded = context.identified.factors[context.facts.identify_on]
-    rows = np.array(list(zip_longest(*map(recorded.rows_of, chosen), fillvalue=-1))).T  # the last one is zero
-    parts = recorded.factor.R, recorded.factor.peak, recorded.factor.n_samples
-    factor = Factor(*(np.concatenate([part, np.zeros_like(part[:1])])[rows] for part in parts))
-    values = context.identified.parameters
-    parameters = {name: np.array([[values[u][name]] for u in chosen]) for name in context.lifting.parameters}
-    factor = lifted_factor(factor, context.lifting, parameters, models.lifting)
-    return partial(
-        _compared, factor, (rows >= 0).sum(axis=1).tolist(), models, chosen, uncertain.form, uncertain.nominal_id
-    )
+    identified, parts = context.identified, list[Array]()
+    recorded = identified.factors[context.facts.identify_on]
+    for unit in chosen:
+        factor = recorded.factor[recorded.rows_of(unit)]
+        values = {n: np.full(len(factor.R), identified.parameters[unit][n]) for n in context.lifting.parameters}
+        parts.append(lifted_factor(factor, context.lifting, values, models.lifting).R)
+    return partial(_compared, parts, models, uncertain.form, chosen.index(uncertain.nominal_id))
 
 
-def _compared(
-    factor: Factor, counts: list[int], models: ModelSet, units: list[str], form: Form, nominal: str
-) -> NoiseShare:
-    """Compare the variation of units with that of models of drawn episodes, in the recordings' units."""
+def _compared(parts: Sequence[Array], models: ModelSet, form: Form, nominal: int) -> NoiseShare:
+    """Compare the variation of units with that of models of drawn episodes, from the factors of every unit's."""
     assert models.alpha is not None
+    counts = [len(part) for part in parts]
+    R = np.stack([np.pad(part, ((0, max(counts) - len(part)), (0, 0), (0, 0))) for part in parts])
     ones = Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
     ranges, weights = models.ranges if models.alpha_in_ranges else ones, episode_weights(counts, DEFAULT.draws, 0)
-    samples = bootstrap_edmd(ranges.triangles(factor.R), models.lifting.n_lifted, models.alpha, weights)
+    samples = bootstrap_edmd(ranges.triangles(R), models.lifting.n_lifted, models.alpha, weights)
     samples = replace(samples, estimate=ranges.restore(samples.estimate), samples=ranges.restore(samples.samples))
     scale = models.output_scale[:, None] / models.input_scale
-    freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s
-    return noise_share(samples, scale, freqs, dt, form, units.index(nominal))
+    return noise_share(samples, scale, models.frequencies(DEFAULT.noise_points), models.sample_period_s, form, nominal)
 
 
 def _others(context: Context, rows: Sequence[ByName]) -> list[Task]:

@@ -24,11 +24,8 @@ def study_text(source: Path, data: ByName, discovery: Discovery | None, findings
     lines = [f"#:schema ./{SCHEMA}", *comment(written)]
     if findings:
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in comment(f"- {text}"))]
-    lines += ["", "[data]", *key_lines({key: data[key] for key in ("source", "reader")})]
-    identify_on = key_lines({"identify_on": data.get("identify_on", "...")})[0]
-    prefix = "" if "identify_on" in data else "# "
-    lines += [f"{prefix}{identify_on}  # condition that models and observers are made from, where there are several"]
-    lines += ['# exclude = ["..."]  # units that take no part']
+    keys = {key: data[key] for key in ("source", "reader", "identify_on") if key in data}
+    lines += ["", "[data]", *key_lines(keys), '# exclude = ["..."]  # units that take no part']
     lines += mapping_lines(discovery) if discovery is not None else []
     for step in data.get("prepare", ()):
         lines += ["", "[[data.prepare]]", *key_lines(step)]

@@ -102,11 +102,9 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
 
 def band_hz(context: Context) -> tuple[float, float] | None:
     """Return the band around the gearbox frequency at the population's top speed; None for other plants."""
-    spec = context.phase_spec
-    if spec is None:
+    if (spec := context.phase_spec) is None:
         return None
-    first = context.identified.models()
-    top_speed = float(first.input_scale[first.inputs.index(spec.reference)]) if spec.reference in first.inputs else 0.0
+    top_speed = context.identified.sizes[spec.reference]
     return gearbox_band_hz(context.config.calibrate, context.population, top_speed)
 
 

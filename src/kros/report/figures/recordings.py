@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...core import AnyArray, ConfigError
-from ...data import Channel, Population, some
+from ...data import Channel, Population
 from ...evaluate.errors import error_spectrum
-from ...identify import PhaseCalibration
 from ..canvas import (
     Captioned,
     Figure,
@@ -108,22 +107,12 @@ def steady_stretch(speed: AnyArray, settle: int) -> slice:
 
 
 def phase(run: RunFolder) -> Captioned:
-    """Draw the phase calibration of a run (Appendix B)."""
+    """Draw phase, lag and concentration of every unit (Appendix B); units that are set aside are drawn hollow."""
     calibration = run.calibration
-    lags = np.degrees([c.lag_rad for u, c in calibration.units.items() if u in run.facts.pooled])
-    weak = [u for u, c in calibration.units.items() if c.concentration < DRAWING.concentrated]
-    mean, low, high = (minus(f"{value:.0f}°") for value in (np.mean(lags), lags.min(), lags.max()))
-    text = f"The lag of the loop is {mean} in the mean, from {low} to {high}."
-    text += f" Concentration below {DRAWING.concentrated:g}: {some(weak)}." if weak else ""
-    return phase_figure(calibration, run.facts.pooled), text
-
-
-def phase_figure(calibration: PhaseCalibration, pooled: Sequence[str]) -> Figure:
-    """Draw phase, lag and concentration of every unit; units that are set aside are drawn hollow."""
     units, values = list(calibration.units), calibration.units.values()
     figure, axes = grid(1, 3)
     columns = np.array([(np.degrees(v.phase_rad), np.degrees(v.lag_rad), v.concentration) for v in values]).T
-    inside = np.isin(units, pooled)
+    inside = np.isin(units, run.facts.pooled)
     for column, panel in zip(columns, axes[0], strict=True):
         for chosen, face in ((inside, Tone.BLUE), (~inside, "none")):
             panel.plot(*np.nonzero(chosen), column[chosen], "o", ms=4, color=Tone.BLUE, mfc=face)
@@ -132,4 +121,6 @@ def phase_figure(calibration: PhaseCalibration, pooled: Sequence[str]) -> Figure
     axes[0, 0].set_yticks([0, 180, 360])
     axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT, lw=DRAWING.thin, ls="--")
     axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
-    return figure
+    lags = columns[1, inside]
+    mean, low, high = (minus(f"{value:.0f}°") for value in (np.mean(lags), lags.min(), lags.max()))
+    return figure, f"The lag of the loop is {mean} in the mean, from {low} to {high}."

@@ -175,15 +175,11 @@ class Store:
         inside = [replace(self, folder=path.parent) for path in self.folder.glob(f"*/*/{MANIFEST}")]
         digests = {artefact.digest for run in (self, *inside) for artefact in run.manifest.values()}
         stored = [artefact for artefact in map(self.stored, digests) if artefact is not None]
-        _sweep(self.artefacts, {digest for artefact in stored for digest in (artefact.digest, *artefact.results)})
-
-
-def _sweep(folder: Path, named: Collection[str]) -> None:
-    """Remove artefacts, results and drafts of a store that are not named."""
-    for path in folder.iterdir() if folder.is_dir() else ():
-        ours = len(path.stem) == sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
-        if ours and path.stem not in named:
-            _remove(path)
+        named = {digest for artefact in stored for digest in (artefact.digest, *artefact.results)}
+        for path in self.artefacts.iterdir():
+            ours = len(path.stem) == sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
+            if ours and path.stem not in named:
+                _remove(path)
 
 
 def _remove(path: Path) -> None:

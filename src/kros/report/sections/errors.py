@@ -52,7 +52,6 @@ def left_out(facts: Facts) -> Section | None:
         f"The units are divided into {folds} folds. For each fold the study is repeated with all other units, and its "
         "observers run on the units of the fold, as on new units. Certified: in how many folds."
     )
-    failed = [f"Fold {int(n) + 1} failed: {reason}" for n, reason in folded["failed"].items()]
     parts = [("made", "designed", ""), ("robust", "set of plants", "certified")]
     parts.append(("relift_certified", "at run time", "certified"))
     about, tables = [Column("observer"), *(Column(title, key, group) for key, title, group in parts)], []
@@ -64,7 +63,7 @@ def left_out(facts: Facts) -> Section | None:
             rows.append(_row(table, name) | counts)
         caption = f"Units left out{in_condition(table.condition)}"
         tables.append(_table(caption, about, [table], rows, facts, sortable=True))
-    return Section("left-out", "Units left out", [text, *failed], tables=tables)
+    return Section("left-out", "Units left out", [text], tables=tables)
 
 
 def _row(table: ErrorTable, name: str) -> Row:

@@ -52,9 +52,7 @@ def calibration(facts: Facts) -> Section | None:
         "the phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse "
         f"apart. Mean lag of the loop: {minus(format(math.degrees(entry['lag_rad']), '.1f'))}°."
     )
-    missing = [row["unit"] for row in facts.get("units") if row["status"] == "not calibrated"]
-    more = [f"Not calibrated, and without models: {some(missing)}."] if missing else []
-    return Section("calibration", "Phase calibration", [text, *more], figure="phase")
+    return Section("calibration", "Phase calibration", [text], figure="phase")
 
 
 def models(facts: Facts) -> Section | None:
@@ -68,17 +66,15 @@ def models(facts: Facts) -> Section | None:
     if any(not name.endswith("_edmd") for name in entries):
         text += " Refined models minimise the simulation error, regularised towards the population mean; the strength "
         text += "is chosen on the last training episode of every unit."
-    rows, columns = list[Row](), {(title, ""): Column(title) for title in ("model", "states", "largest pole")}
+    rows, columns = list[Row](), [Column(title) for title in ("model", "states", "largest pole")]
     for name, entry in entries.items():
-        pole = minus(radius_text(entry["spectral_radius_max"]))
-        row: Row = {"model": model_label(name), "states": entry["order"], "largest pole": pole}
-        for channel, errors in entry.get("freerun_error_percent", {}).items():
-            for what, error in errors.items():
-                row[channel, what] = error
-                columns[channel, what] = Column(f"{what} (%)", (channel, what), words(channel), best=True)
-        rows.append(row)
+        pole, errors = minus(radius_text(entry["spectral_radius_max"])), entry.get("freerun_error_percent", {})
+        known = {(channel, what): error for channel, of in errors.items() for what, error in of.items()}
+        rows.append({"model": model_label(name), "states": entry["order"], "largest pole": pole, **known})
+    for channel, what in dict.fromkeys(key for row in rows for key in row if isinstance(key, tuple)):
+        columns.append(Column(f"{what} (%)", (channel, what), words(channel), best=True))
     caption = "Simulation of held-out episodes from their first state, error in percent of the largest value"
-    table = build(caption, list(columns.values()), rows)
+    table = build(caption, columns, rows)
     return Section("models", "Models", [text], tables=[table], figure="free_run")
 
 

@@ -9,11 +9,16 @@ from operator import itemgetter
 from ...core import ByName, grouped
 from ..content import Column, Row, Section, build
 from ..facts import Facts
-from ..names import in_condition, number, words
+from ..names import in_condition, words
 from ..theme import DRAWING
 
 _ERRORS = {"error (%)": "error_percent", "against the true signal (%)": "true_error_percent"}
-_OF_SCORES = {"score (dB)": "score", "detectable change of gain (%)": "detectable", "recordings needed (s)": "needed_s"}
+_OF_SCORES = {
+    "score (dB)": "score",
+    "most at (Hz)": "freq_hz",
+    "detectable change of gain (%)": "detectable",
+    "recordings needed (s)": "needed_s",
+}
 _SCORES = (
     "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. A "
     "unit above the threshold is flagged. A change of a hidden state's gain below the detectable one is not."
@@ -44,7 +49,7 @@ def units(facts: Facts) -> Section | None:
     caption = f"{len(shown)} of {len(rows)} {order}; errors in percent of the largest value"
     table = build(caption, [*columns, Column("phase (°)", "phase")], shown, sortable=True)
     text = [f"Errors are those of “{facts.label}”."] if facts.deployed else []
-    text += [_SCORES, *(_flagged(r) for r in scores[: DRAWING.units] if r["outlier"])] if scores else []
+    text += [_SCORES] if scores else []
     return Section("units", "Units", [" ".join(text)], tables=[table], figure="outlier_scores" if scores else "")
 
 
@@ -67,12 +72,3 @@ def _status(row: ByName, scores: Sequence[ByName]) -> str:
     silent = bool(scores) and all(r.get("status") in ("not enough data", "cannot tell") for r in scores)
     status = str(row.get("status", "ok"))
     return "undecided" if silent and status == "ok" else status
-
-
-def _flagged(row: ByName) -> str:
-    """Say where and how clearly a flagged unit differs."""
-    text = f"Unit {row['unit']}{in_condition(row['condition'])}: score {number(row['score'])} dB"
-    text += f", most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""
-    if row.get("lowest_db") is not None:
-        text += f"; {number(row['lowest_db'])} to {number(row['highest_db'])} dB over the choices of the nominal unit"
-    return f"{text}."

@@ -30,7 +30,7 @@ class Drawing:
     states: int = 4  # rows of one episode or plant
     units: int = 400  # rows of the table of units
     label: int = 16  # characters of a name beside an axis
-    zoom: int = 300  # samples at constant speed that are enlarged
+    zoom: float = 0.04  # share of an episode that is enlarged
     settled: float = 0.1  # share of an episode after which errors are drawn: at the start no observer knows the state
     diverged: float = 1e3  # ranges of the signal: a larger error is not drawn
     segment: int = 1024  # samples of a spectrum

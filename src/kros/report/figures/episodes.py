@@ -107,24 +107,23 @@ def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[i
 
 
 def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> Captioned:
-    """Return the figure of some episodes of a run and its caption; enlarged are some turns of the gearbox, or less."""
+    """Return the figure of some episodes of a run and its caption."""
     blocks = [replace(block, states=block.states[: DRAWING.states]) for block in blocks]
-    size = DRAWING.zoom if run.has("calibration/calibration.json") else len(run.shown[0].states) // 8
     band_hz = run.evaluation["band_hz"]
     text += " Shaded: the band around the gearbox frequency at top speed." if band_hz else ""
-    return blocks_figure(run.channels, blocks, size, band_hz), text
+    return blocks_figure(run.channels, blocks, band_hz), text
 
 
 def blocks_figure(
-    channels: Sequence[Channel], blocks: Sequence[Block], size: int, band_hz: Sequence[float] | None = None
+    channels: Sequence[Channel], blocks: Sequence[Block], band_hz: Sequence[float] | None = None
 ) -> Figure:
-    """Draw a row a state: the episode, `size` samples of it, the error over time, and its power spectral density."""
+    """Draw a row a state: the episode, a part of it, the error over time, and its power spectral density."""
     figure, axes = grid(sum(len(block.states) for block in blocks), 4)
     first = 0
     for block in blocks:
         panels = axes[first : first + len(block.states)]
         first += len(block.states)
-        window = window_of(block.shown, size)
+        window = window_of(block.shown)
         for row, i in zip(panels, block.states, strict=True):
             _draw_state(row, block, i, window)
             row[3].set_ylabel(f"{squared(channels[i].unit)}/Hz", size="small")
@@ -188,10 +187,10 @@ def references(channels: Sequence[Channel]) -> dict[str, int]:
     return {name: inputs.index(f"target_{name}") for name in states if f"target_{name}" in inputs}
 
 
-def window_of(shown: Shown, size: int) -> slice:
+def window_of(shown: Shown) -> slice:
     """Return a window that begins where the last input is largest, as a reference of speed is at constant speed."""
     samples = len(shown.states)
-    size = max(min(size, samples), 2)
+    size = max(int(DRAWING.zoom * samples), 2)
     begin = min(int(np.abs(shown.inputs[:, -1]).argmax()), samples - size)
     return slice(begin, begin + size)
 
@@ -244,4 +243,4 @@ def _episode_figure(population: Population, batch: EpisodeBatch, lines: Lines) -
     (key,), states = batch.keys, batch.states[:, 0]
     shown = Shown(key, batch.sample_period_s, states, batch.inputs[:, 0])
     block = Block(episode_title(key), shown, lines, range(states.shape[1]))
-    return blocks_figure(population.channels, [block], len(states) // 8)
+    return blocks_figure(population.channels, [block])

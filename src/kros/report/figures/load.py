@@ -24,4 +24,4 @@ def load_torque(run: RunFolder) -> Captioned:
     parts = [f"{r['observer']} {r['error_percent']:.0f} % of the load" for r in rows]
     text = f"Unit {shown.key.unit}{in_condition(shown.key.condition)}, in units of current. Errors below 5 Hz over all "
     text += f"units whose load was not known: {'; '.join(parts)}."
-    return blocks_figure([Channel("load", Role.STATE)], blocks, len(shown.states) // 8), text
+    return blocks_figure([Channel("load", Role.STATE)], blocks), text

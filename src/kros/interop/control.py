@@ -15,9 +15,8 @@ from ..core import DataError, DimensionError, MissingDependencyError, StateSpace
 try:
     import control
 except ImportError as error:
-    raise MissingDependencyError(
-        "kros.interop.control needs python-control, which is not installed; install it (pip install 'kros[control]')."
-    ) from error
+    text = "kros.interop.control needs python-control; install it, pip install 'kros[control]'."
+    raise MissingDependencyError(text) from error
 
 
 def to_control(
@@ -66,9 +65,7 @@ def to_control(
         return [to_control(system[i], name=name, **signals) for i in range(system.batch_shape[0])]
     for (kind, names), count in zip(signals.items(), (system.n_states, system.n_inputs, system.n_outputs), strict=True):
         if names is not None and (isinstance(names, str) or not len(names) == len(set(names)) == count):
-            raise DimensionError(
-                f"to_control: {count} {kind} need as many different names, found {names!r}; correct the list."
-            )
+            raise DimensionError(f"to_control: {count} {kind} need as many different names, found {names!r}.")
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
     # Copies: python-control may change matrices in place. States that do nothing stay, since they carry names.
     matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
@@ -102,14 +99,11 @@ def from_control(system: Any) -> StateSpace:
     [[0.5]]
     """
     if not isinstance(system, control.StateSpace | control.TransferFunction):
-        raise DimensionError(
-            f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}."
-        )
+        kind = type(system).__name__
+        raise DimensionError(f"from_control: needs a control.StateSpace or control.TransferFunction, found {kind}.")
     if system.dt is None or system.dt is True:
-        raise DimensionError(
-            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, "
-            "C, D, 0.001), or 0."
-        )
+        unknown = f"the sampling period is not known (dt = {system.dt})"
+        raise DimensionError(f"from_control: {unknown}; give it in seconds, control.ss(A, B, C, D, 0.001), or 0.")
     if isinstance(system, control.TransferFunction):
         return _realised(system)
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")

@@ -20,10 +20,8 @@ try:
     from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
     from sklearn.utils.validation import check_is_fitted, validate_data
 except ImportError as error:
-    raise MissingDependencyError(
-        "KoopmanRegressor needs scikit-learn 1.6 or newer; install it (pip install 'kros[sklearn]'), or use "
-        "kros.identify."
-    ) from error
+    text = "KoopmanRegressor needs scikit-learn 1.6 or newer; install it, pip install 'kros[sklearn]'."
+    raise MissingDependencyError(text) from error
 
 
 class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -88,10 +86,10 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             With ``alpha = 0``, a function or input that depends on the others or does not vary.
         """
         if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf:
-            raise ConfigError(
-                "KoopmanRegressor: functions should be a list of texts and alpha at least zero, found "
-                f"{self.functions!r}, {self.alpha!r}."
+            problem = (
+                f"functions should be a list of texts and alpha at least zero, found {self.functions!r}, {self.alpha!r}"
             )
+            raise ConfigError(f"KoopmanRegressor: {problem}.")
         X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
         self._one_dimensional, after = y.ndim == 1, y.reshape(len(y), -1).astype(float)
         n, columns = after.shape[1], X.shape[1]
@@ -100,16 +98,12 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         names = getattr(self, "feature_names_in_", [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(columns - n)])
         self.lifting_ = Lifting(tuple(names[:n]), tuple(self.functions), (), tuple(names[n:]))
         if self.lifting_.history:
-            raise ConfigError(
-                "KoopmanRegressor: rows stand by themselves, functions cannot read earlier samples; use kros.identify."
-            )
+            raise ConfigError("KoopmanRegressor: functions of rows cannot read earlier samples; use kros.identify.")
         with np.errstate(all="ignore"):
             rows = np.concatenate([self.lifting_.lift(X[:, :n]), X[:, n:], self.lifting_.lift(after)], axis=1)
         if not np.isfinite(rows).all():
-            raise DataError(
-                "KoopmanRegressor: a lifted function of X is NaN or inf in some row; choose functions that are "
-                "defined everywhere."
-            )
+            problem = "a lifted function of X is NaN or inf in some row"
+            raise DataError(f"KoopmanRegressor: {problem}; choose functions that are defined everywhere.")
         matrices = edmd(triangular(rows), self.lifting_.n_lifted, self.alpha)
         self.A_, self.B_ = matrices.A, matrices.B
         return self

@@ -60,9 +60,7 @@ def place(folder: Path, name: str) -> Path:
     for depth in range(1, len(parts)):
         path = folder.joinpath(*parts[:depth])
         if path.is_symlink():
-            raise DataError(
-                f"Run folder {folder}: {path} is a link, and results stay inside the folder; put a folder in its place."
-            )
+            raise DataError(f"Run folder {folder}: {path} is a link; put a folder in its place.")
     return folder / name
 
 

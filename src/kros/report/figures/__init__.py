@@ -108,9 +108,7 @@ def plot(result: Any, kind: str | None, **options: Any) -> Figure:
     function = drawing(kinds[kind])
     known = list(signature(function).parameters)[1:]
     if not set(options) <= set(known):
-        raise ConfigError(
-            f"Plot: a {name} has no option {', '.join(options)}; {kind!r} has {', '.join(known) or 'none'}."
-        )
+        raise ConfigError(f"Plot: no option {', '.join(options)}; {kind!r} has {', '.join(known) or 'none'}.")
     with style():
         figure: Figure = function(result, **options)
     return figure

@@ -67,18 +67,14 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
         check_channels(population, observer)
         errors = errors_beside_bounds(context, population, recordings.values)
     if not names:
-        raise ConfigError(
-            f"Run {store.folder}: has no outlier scores to compare with; run the study until quantify, with at least "
-            "three units."
-        )
+        advice = "run the study until quantify, with at least three units"
+        raise ConfigError(f"Run {store.folder}: has no outlier scores to compare with; {advice}.")
     sets = {name: ModelSet.load(store.path("models", name)) for name in names}
     known = {name: models for name, models in sets.items() if models.condition in population.conditions}
     if not known:
         modelled, there = (", ".join(c) for c in ([m.condition for m in sets.values()], population.conditions))
-        raise DataError(
-            f"Checking {data}: the recordings have the conditions {there}, and the run has models of {modelled} alone; "
-            "name the condition, as in the study."
-        )
+        problem = f"the recordings have the conditions {there}, and the run has models of {modelled} alone"
+        raise DataError(f"Checking {data}: {problem}; name the condition, as in the study.")
     rows = Rows()
     with open_executor(workers) as executor:
         for name, models in known.items():

@@ -59,9 +59,8 @@ def open_data(config: StudyConfig, data: Path, optional: Collection[str]) -> Pop
     except (ConfigError, DataError) as error:
         if not data.is_dir() or data.suffix == ".toml":
             raise
-        raise type(error)(
-            f"{error} Recordings of another kind than the run's are named by a TOML with [data], as in a study."
-        ) from error
+        hint = "Recordings of another kind than the run's are named by a TOML with [data], as in a study."
+        raise type(error)(f"{error} {hint}") from error
 
 
 def hidden_states(observer: Observer) -> Names:
@@ -76,22 +75,16 @@ def check_channels(population: Population, observer: Observer, *, hidden: bool =
     missing = [name for name in needed if name not in there]
     if missing or (hidden and needed != there):
         problem = f"{', '.join(missing)} is missing" if missing else "they are others, or in another order"
-        raise DataError(
-            f"Channels: {problem}; the observer needs {', '.join(needed)}, the recordings have {', '.join(there)}; "
-            "record them, or correct the mapping."
-        )
+        both = f"the observer needs {', '.join(needed)}, the recordings have {', '.join(there)}"
+        raise DataError(f"Channels: {problem}; {both}; record them, or correct the mapping.")
     units = observer.about.get("units_of_measure", {})
     for channel in population.channels:
         if channel.unit and units.get(channel.name, channel.unit) not in ("", channel.unit):
-            raise DataError(
-                f"Channels: {channel.name} is in {units[channel.name]!r} in the run and in {channel.unit!r} in the "
-                "recordings; declare a scale step, or leave the unit out where it is only written differently."
-            )
+            both = f"{channel.name} is in {units[channel.name]!r} in the run and in {channel.unit!r} in the recordings"
+            raise DataError(f"Channels: {both}; declare a scale step, or leave out a unit that is written differently.")
     if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=AGREED):
-        raise DataError(
-            f"Sampling period: the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} "
-            "s; declare a resample step."
-        )
+        both = f"the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s"
+        raise DataError(f"Sampling period: {both}; declare a resample step.")
 
 
 def load_observer(context: Context, name: str = "deployed") -> Observer:
@@ -102,10 +95,8 @@ def load_observer(context: Context, name: str = "deployed") -> Observer:
     known = {"deployed": DEPLOYED} | {n: ("observers", f"{n}.json") for n in context.observers_record["names"]}
     known |= {f"{k}/{LOAD}": (LOAD, f"{k}.json") for k in ("koopman", "linear") if store.holds(LOAD, f"{k}.json")}
     if name not in known:
-        raise ConfigError(
-            f"Run {store.folder}: has no observer {name!r}{did_you_mean(name, known) or ';'} known are "
-            f"{', '.join(known)}."
-        )
+        hint = did_you_mean(name, known) or ";"
+        raise ConfigError(f"Run {store.folder}: has no observer {name!r}{hint} known are {', '.join(known)}.")
     chosen, about = Observer.load(store.path(*known[name])), context.deployed.about
     if chosen.about:
         return chosen
@@ -164,10 +155,8 @@ class FieldRecordings:
             missing = [name for name in self.observer.lifting.parameters if name not in known]
             if set(missing) - {self.name}:
                 reason, first = reasons.get(unit, "it was not calibrated."), missing[0]
-                raise IdentificationError(
-                    f"Parameter {', '.join(missing)} of unit {unit}: {reason} Give it, --parameter "
-                    f"{unit}.{first}=VALUE, or let it be followed, --track {first}."
-                )
+                advice = f"Give it, --parameter {unit}.{first}=VALUE, or let it be followed, --track {first}."
+                raise IdentificationError(f"Parameter {', '.join(missing)} of unit {unit}: {reason} {advice}")
             if self.name is not None:
                 known[self.name] = self._start(unit, self.name) if missing else known[self.name]
                 start = "of the smallest innovation" if missing else f"that is {self.sources.get(unit)}"

@@ -51,10 +51,8 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     reader, discovery = detect_reader(source), None
     if reader in ("parquet", "motor-drive-raw"):
         if wanted != Wanted():
-            raise ConfigError(
-                f"Looking at {source}: these are {reader} recordings, which say what channels are; leave out "
-                "--measured, --input, --files and --period."
-            )
+            reason = f"these are {reader} recordings, which say what channels are"
+            raise ConfigError(f"Looking at {source}: {reason}; leave out --measured, --input, --files and --period.")
         data: Record = {"source": _source(source, out), "reader": reader}
     else:
         discovery = discover(source, wanted, work, fewest_samples())

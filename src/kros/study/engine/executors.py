@@ -113,10 +113,8 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
         try:
             return [function(task) for task in tasks]
         except FileNotFoundError as error:
-            raise KrosError(
-                f"{worker}: finds no {error.filename}; recordings and run folder must be in a shared folder, the same "
-                "path on every worker."
-            ) from error
+            need = "recordings and run folder must be in a shared folder, the same path on every worker"
+            raise KrosError(f"{worker}: finds no {error.filename}; {need}.") from error
 
 
 @contextmanager
@@ -145,9 +143,8 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
         get_address_host_port(address)  # a client made with something else goes on trying
         client = Client(address, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"--scheduler {address}: no Dask scheduler of this version answers there ({error}); correct the address."
-        ) from error
+        problem = f"no Dask scheduler of this version answers there ({error})"
+        raise ConfigError(f"--scheduler {address}: {problem}; correct the address.") from error
     if not client.nthreads():
         log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)
     messages = logging.getLogger("distributed.client")

@@ -91,9 +91,7 @@ class Store:
             for name in artefact.files if stage != Stage.REPORT else ():
                 if not artefact.matches(self.folder, name):
                     reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
-                    raise DataError(
-                        f"Run: {self.path(name)}, which stage {stage} wrote, {reason}; run the study again."
-                    )
+                    raise DataError(f"Run: {self.path(name)} of stage {stage} {reason}; run the study again.")
 
     def stored(self, digest: str) -> Artefact | None:
         """Return an artefact that is in the store, whole."""
@@ -141,10 +139,8 @@ class Store:
             link_or_copy(source, beside)
             beside.replace(target)
         except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            raise ConfigError(
-                f"Run folder {self.folder}: {error.filename2 or error.filename} is in the place of a result; move it "
-                "away."
-            ) from error
+            blocking = error.filename2 or error.filename
+            raise ConfigError(f"Run folder: {blocking} is in the place of a result; move it away.") from error
 
     def drop(self, *stages: str) -> None:
         """Forget stages and their files in the run folder that are as written; artefacts stay."""
@@ -218,10 +214,8 @@ def require_own(out: Path, config: StudyConfig) -> bool:
         study = read_json(out / STUDY)
         there, this = (study["name"], study["data"]["source"]), (config.name, str(config.data.source))
     if there != this:
-        raise ConfigError(
-            f"Output {out}: holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}; name "
-            "another folder, or remove this one if it is not needed."
-        )
+        both = f"holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}"
+        raise ConfigError(f"Output {out}: {both}; name another folder, or remove this one if it is not needed.")
     return False
 
 

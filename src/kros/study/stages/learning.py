@@ -54,10 +54,8 @@ def draw(config: StudyConfig, population: Population) -> Names:
     pooled = [u.id for u in population.units if u.group != OUTLIERS]
     free = [u for u in pooled if u not in named]
     if n and (n > len(free) or len(pooled) - n < FEWEST):
-        raise ConfigError(
-            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} named by the study, and "
-            f"a population needs {FEWEST}; reserve fewer."
-        )
+        there = f"there are {len(pooled)} units, {len(free)} not named by the study, and a population needs {FEWEST}"
+        raise ConfigError(f"evaluate.reserve = {n}: {there}; reserve fewer.")
     return draw_reserve(free, n)
 
 

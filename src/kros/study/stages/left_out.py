@@ -45,10 +45,8 @@ def parted(units: Sequence[str], folds: int) -> list[list[str]]:
     """Return the units of every fold."""
     parts = [list(units[fold::folds]) for fold in range(folds)]
     if folds > len(units) or len(units) - len(parts[0]) < FEWEST:
-        raise ConfigError(
-            f"evaluate.folds = {folds}: of {len(units)} units each fold needs one, and leaves at least {FEWEST} to "
-            "learn from; ask for another number, or record more units."
-        )
+        needs = f"of {len(units)} units each fold needs one, and leaves at least {FEWEST} to learn from"
+        raise ConfigError(f"evaluate.folds = {folds}: {needs}; ask for another number, or record more units.")
     return parts
 
 

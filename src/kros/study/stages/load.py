@@ -168,10 +168,8 @@ def _known(context: Context, usable: list[str]) -> tuple[list[str], list[str]]:
     known = list(context.config.load.units) or loaded[: TRIAL.known]
     others = [u for u in usable if u not in known]
     if not set(known) <= set(usable) or not known or not any(facts.keys("test", u, condition) for u in others):
-        raise ConfigError(
-            f"Load: needs units with a known load and others to judge on, both recorded in condition {condition!r}; "
-            f"known {', '.join(known) or 'none'}, others {', '.join(others[:10]) or 'none'}; see load.units."
-        )
+        needs = f"needs units with a known load and others to judge on, both recorded in condition {condition!r}"
+        raise ConfigError(f"Load: {needs}; known {some(known) or 'none'}, others {some(others) or 'none'}.")
     return known, others
 
 

@@ -175,7 +175,7 @@ def score_condition(
 
 
 def monitored(recordings: FieldRecordings) -> Rows:
-    """Return a row for every unit and condition whose hidden channels were not recorded: the monitor's level decides."""
+    """Return a row for every unit and condition without recorded hidden channels: the monitor's level decides."""
     population, observer, rows = recordings.population, recordings.observer, Rows()
     missing = [name for name in observer.recorded if name not in population.states]
     monitor = observer.monitor

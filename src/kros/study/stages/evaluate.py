@@ -59,7 +59,7 @@ def run(context: Context) -> None:
 
 
 def judged(context: Context, episodes: HeldOut, roles: Mapping[str, str]) -> tuple[dict[str, Outcome], Record]:
-    """Run all observers of a study, then the baselines that are made here, on some episodes; return errors and facts."""
+    """Run the observers of a study, and baselines that are made here, on some episodes; return errors and facts."""
     groups, makers = alike(load_observers(context).values()), baseline_makers(context, episodes)
     work: list[Callable[[], list[Outcome]]] = [partial(of_baseline, episodes, make) for make in makers.values()]
     work += [partial(episodes.observers, group) for group in groups]

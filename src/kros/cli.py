@@ -220,9 +220,7 @@ def init(
     measured: Annotated[Names, _option("State that is available at run time; repeatable.", metavar="NAME")] = None,
     input_: Annotated[Names, _option("Input; repeatable.", "--input", metavar="NAME")] = None,
     out: Annotated[Path, _option("New study file.")] = Path("study.toml"),
-    files: Annotated[
-        str | None, _option("What a file is, in place of what its name seems to say.", metavar="REGEX")
-    ] = None,
+    files: Annotated[str | None, _option("What a file's name says, as an expression.", metavar="REGEX")] = None,
     period: Annotated[float | None, _option("Sampling period, where no column holds time.", metavar="SECONDS")] = None,
 ) -> None:
     """Look at a folder of recordings and write a study for it."""

@@ -180,8 +180,7 @@ def require_usable(config: StudyConfig, until: Stage, population: Population | N
     require_measured(config.sensor, population.measured)
     config.estimator.require_states(population.states)
     require_load(config.load, population)
-    if config.evaluate.folds:
-        left_out.parted([u.id for u in population.units if u.group != OUTLIERS], config.evaluate.folds)
+    left_out.parted([u.id for u in population.units if u.group != OUTLIERS], config.evaluate.folds)
 
 
 def run_in(

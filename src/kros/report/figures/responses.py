@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...core import AnyArray, StateSpace, grouped
+from ...core import AnyArray, StateSpace, gain, grouped
 from ...design.task import split_name
 from ...identify import IdentifiedModels, ModelSet
 from ...synthesis.result import Injection, Synthesis
@@ -92,4 +92,4 @@ def scaled_filter(synthesis: Synthesis, models: ModelSet) -> StateSpace:
     K = synthesis.controller
     inside = models.output_scale[list(models.measured)]
     outside = models.input_scale if synthesis.injection is Injection.INPUT else models.output_scale
-    return StateSpace(K.A, K.B * inside, K.C / outside[:, None], K.D * inside / outside[:, None], K.dt)
+    return gain(np.diag(1 / outside), K.dt) @ K @ gain(np.diag(inside), K.dt)

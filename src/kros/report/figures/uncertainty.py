@@ -16,7 +16,7 @@ from ..canvas import Axes, Captioned, Figure, decibel, frequency_axis, grid, leg
 from ..names import model_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, HUES, Tone
-from .entries import differing, entries_figure
+from .entries import Names, differing, entries_figure, entry_names
 
 FORM_TONES = {
     Form.ADDITIVE: Tone.INK,
@@ -75,8 +75,7 @@ def weights(run: RunFolder) -> Captioned:
     figure, axes = grid(len(chosen), 3, sharex=True)
     for row, (name, residuals) in zip(axes, chosen.items(), strict=True):
         model = run.uncertain[name]
-        both = model.form.at_input and model.form.sees_input
-        _draw_weights(row, model, run.models[name].inputs if both else ())
+        _draw_weights(row, model, entry_names(model.form, run.models[name]))
         ratio_panel(row[2], residuals)
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
         parts.append(f"{model_label(name)} {number(model.overbound_db_max)} dB")
@@ -95,12 +94,12 @@ def uncertain_figure(model: UncertainModel) -> Figure:
     return figure
 
 
-def _draw_weights(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] = ()) -> None:
-    """Draw left and right weights over the optimal bound."""
+def _draw_weights(row: Sequence[Axes], model: UncertainModel, names: Names = ((), ())) -> None:
+    """Draw left and right weights over the optimal bound, with the names of signals or their numbers."""
     fitted = model.weight.magnitudes(model.freqs_hz)
     cover = in_gauge(model.cover, fitted)
-    _side(row[0], model.freqs_hz, fitted.left, cover.left, names)
-    _side(row[1], model.freqs_hz, fitted.right, cover.right, names)
+    _side(row[0], model.freqs_hz, fitted.left, cover.left, names[0])
+    _side(row[1], model.freqs_hz, fitted.right, cover.right, names[1])
 
 
 def in_gauge(cover: Cover, other: Cover) -> Cover:
@@ -114,7 +113,7 @@ def in_gauge(cover: Cover, other: Cover) -> Cover:
 def _side(axes: Axes, freqs_hz: AnyArray, magnitudes: AnyArray, cover: AnyArray, names: Sequence[str]) -> None:
     """Draw the entries of one weight, each with its name."""
     columns = range(magnitudes.shape[1])
-    labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
+    labels = names or [str(i + 1) for i in columns]
     for i, tone in zip(columns, HUES, strict=False):
         shade, line = decibel(cover[:, i]), decibel(magnitudes[:, i])
         axes.plot(freqs_hz, shade, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")

@@ -44,7 +44,7 @@ def wanted(config: StudyConfig) -> bool:
 def parted(units: Sequence[str], folds: int) -> list[list[str]]:
     """Return the units of every fold."""
     parts = [list(units[fold::folds]) for fold in range(folds)]
-    if folds > len(units) or len(units) - len(parts[0]) < FEWEST:
+    if parts and (folds > len(units) or len(units) - len(parts[0]) < FEWEST):
         needs = f"of {len(units)} units each fold needs one, and leaves at least {FEWEST} to learn from"
         raise ConfigError(f"evaluate.folds = {folds}: {needs}; ask for another number, or record more units.")
     return parts
@@ -52,18 +52,17 @@ def parted(units: Sequence[str], folds: int) -> list[list[str]]:
 
 def run(context: Context) -> None:
     """Make the study once for every fold, and run the deployed observer on the units in reserve."""
-    models, wanted_folds = context.identified.models(), context.config.evaluate.folds
-    folds = parted([u for u in context.facts.pooled if u in models.unit_ids], wanted_folds) if wanted_folds else []
+    units = [u for u in context.facts.pooled if u in context.identified.models().unit_ids]
     if context.facts.reserve:
         save_artifact(context.store.draft(NEXT), NEXT, next_unit(context))
-    if folds:
+    if folds := parted(units, context.config.evaluate.folds):
         save_artifact(context.store.draft(FOLDER), FOLDER, of_folds(context, folds))
 
 
 def results(context: Context) -> Record:
     """Return what the stage adds to the metrics."""
-    parts = {FOLDER: context.config.evaluate.folds, NEXT: context.config.evaluate.reserve}
-    return {name: load_artifact(context.store.path(name), name)[0] for name, count in parts.items() if count}
+    known = [name for name in (FOLDER, NEXT) if context.store.holds(name, f"{name}.json")]
+    return {name: load_artifact(context.store.path(name), name)[0] for name in known}
 
 
 def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> Record:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from ...report import files
+from ...report.html import render
 from ..config import Stage
 from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
@@ -14,7 +16,6 @@ REPORT = "report.html"
 
 def run(context: Context) -> None:
     """Write report.html from the run folder and the metrics so far."""
-    from ...report.html import render
     from ..metrics import collect_metrics
 
     metrics = collect_metrics(context, Stage.LEFT_OUT)
@@ -23,15 +24,11 @@ def run(context: Context) -> None:
 
 def render_run(folder: Path, workers: int) -> Path:
     """Write the report of a finished run again; `workers` processes draw its figures."""
-    from ...report.html import render
-
     with open_finished(folder, alone=True) as context, open_executor(workers) as executor:
         return render(folder, context.store.metrics(), executor.map)
 
 
 def write_figures(folder: Path, out: Path) -> list[str]:
     """Write the figures of a finished run as PNG and PDF."""
-    from ...report import files
-
     with open_finished(folder):
         return files.write_figures(folder, out)

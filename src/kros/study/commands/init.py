@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +37,6 @@ def study_text(source: Path, data: ByName, discovery: Discovery | None, findings
 
 
 SCHEMA = "study.schema.json"  # which editors look up by the first line of a study
-NO_LOAD = "unloaded noload leerlauf ohnelast unbelastet leer idle empty vide avide sanscharge"
 
 
 def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> list[str]:
@@ -60,12 +58,12 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
         data |= {"prepare": list(discovery.prepare)} if discovery.prepare else {}
     folder = out.parent.absolute()
     population = open_source(validate_config({"data": dict(data)}, folder, str(out)))
-    unloaded = _unloaded(population)
-    data |= {} if unloaded is None else {"identify_on": unloaded}
+    condition = _condition(population)
+    data |= {"identify_on": condition} if condition else {}
     findings = list(discovery.findings if discovery else ())
     try:
         check_population(population, allow_single=True)
-        population, facts = survey(population, work, identify_on=unloaded, fewest=fewest_samples())
+        population, facts = survey(population, work, identify_on=condition, fewest=fewest_samples())
         findings += facts.alerts
     except DataError as error:
         findings.append(f"kros run would refuse this: {error}")
@@ -86,10 +84,9 @@ def _source(source: Path, out: Path) -> str:
         return str(source.absolute())
 
 
-def _unloaded(population: Population) -> str | None:
-    """Return the condition without load where its name is not the default, else the one that most units have."""
+def _condition(population: Population) -> str | None:
+    """Return the condition that most units have, where there are several and none has the name of the default."""
     conditions = population.conditions
     if len(conditions) < 2 or UNLOADED in conditions:
         return None
-    named = [c for c in conditions if re.sub(r"[\W_]", "", c.lower()) in NO_LOAD.split()]
-    return named[0] if named else max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))
+    return max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))

@@ -76,13 +76,9 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> Record:
             log.info("%s could not be computed: %s", name, error)
         facts[name] = fact
     shown = next(i for i, key in enumerate(trial.test.keys) if key.condition == TRIAL.condition)
-    key, dt, estimates = (
-        trial.test.keys[shown],
-        trial.test.sample_period_s,
-        {n: v[:, [shown]] for n, v in curves.items()},
-    )
-    one = Shown(key, dt, trial.truth[1][:, [shown]], trial.test.inputs[:, shown], estimates)
-    one.save(context.store.draft(LOAD))
+    key, estimates = trial.test.keys[shown], {n: values[:, [shown]] for n, values in curves.items()}
+    signals = trial.truth[1][:, [shown]], trial.test.inputs[:, shown]
+    Shown(key, trial.test.sample_period_s, *signals, estimates).save(context.store.draft(LOAD))
     rows = [trial.row(*item) for item in curves.items()]
     settings = {"corner_hz": TRIAL.judged_hz, "settle_s": TRIAL.settle_s}
     return {"load_torque": {"known": trial.known, "rows": rows, "observers": facts, **settings}}

@@ -9,17 +9,7 @@ import numpy as np
 from ...core import AnyArray, ConfigError
 from ...data import Channel, Population
 from ...evaluate.errors import error_spectrum
-from ..canvas import (
-    Captioned,
-    Figure,
-    grid,
-    label_below,
-    legend,
-    logarithmic,
-    note,
-    set_titles,
-    units_axis,
-)
+from ..canvas import Captioned, Figure, grid, label_below, legend, logarithmic, note, set_titles, units_axis
 from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
@@ -29,9 +19,8 @@ _RECORDED, _REFERENCE = Look(Tone.INK), Look(Tone.GOLD, weight=3, opacity=0.5)
 
 
 def recorded_episodes(run: RunFolder) -> list[Shown]:
-    """Return one held-out episode of one unit in every condition, the condition of the models first."""
-    episodes = [s for s in run.shown if s.key.unit == run.shown[0].key.unit]
-    return sorted(episodes, key=lambda s: s.key.condition != run.facts.identify_on)
+    """Return one held-out episode of the nominal unit in every condition, the condition of the models first."""
+    return [shown for shown in run.shown if shown.key.unit == run.shown[0].key.unit]
 
 
 def signals(run: RunFolder) -> Captioned:

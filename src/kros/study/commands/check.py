@@ -59,13 +59,12 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     population = open_data(context.config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
     check_recordings(with_gaps(population))
-    errors = dict[tuple[str, str], Rows]()
     if observer is not None:
-        recordings = FieldRecordings.open(context, data)
         if any(name not in population.states for name in observer.recorded):
-            return monitored(recordings)
+            return monitored(FieldRecordings.open(context, data))
         check_channels(population, observer)
-        errors = errors_beside_bounds(context, population, recordings.values)
+    values = unit_parameters(population, context.calibration, context.facts.identify_on)
+    errors = errors_beside_bounds(context, population, values) if observer else {}
     if not names:
         advice = "run the study until quantify, with at least three units"
         raise ConfigError(f"Run {store.folder}: has no outlier scores to compare with; {advice}.")
@@ -79,7 +78,9 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
     with open_executor(workers) as executor:
         for name, models in known.items():
             outliers = OutlierModel.load(store.path("outliers", name))
-            rows += score_condition(context, population, models, outliers, executor, same_unit)
+            factors = EpisodeFactors.load(store.path("factors", quote(models.condition, safe="")))
+            recorded = Recorded.of(factors, models, outliers.freqs_hz)
+            rows += score_condition(recorded, outliers, population, values, executor, same_unit)
     for row in rows:
         if beside := errors.get((row["unit"], row["condition"])):
             row["error"] = max(beside, key=itemgetter("ratio"))
@@ -139,25 +140,22 @@ def _parts(estimate: Array, recorded: Array) -> Array:
 
 
 def score_condition(
-    context: Context,
-    population: Population,
-    models: ModelSet,
+    recorded: Recorded,
     outliers: OutlierModel,
+    population: Population,
+    values: Values,
     executor: Executor,
     same_unit: bool,
 ) -> Rows:
     """Score all units that were recorded in one condition."""
-    condition, training = models.condition, training_keys(population)
+    models, training, rows = recorded.models, training_keys(population), Rows()
+    condition, halves = models.condition, recorded.halves()
     everything = {unit: keys for unit, c, keys in population.groups() if c == condition}
-    parameters = unit_parameters(population.select(everything), context.calibration, context.facts.identify_on)
     tasks = [(population.select([u], [condition]), keys, models.lifting) for u, keys in everything.items()]
-    factors = EpisodeFactors.load(context.store.path("factors", quote(condition, safe="")))
-    recorded, rows = Recorded.of(factors, models, outliers.freqs_hz), Rows()
-    halves = recorded.halves()
     motion = None if halves is None else outliers.motion_levels(*halves)
     for (unit, keys), factor in zip(everything.items(), executor.map(reduce_episodes, tasks), strict=True):
         chosen = [keys.index(k) for k in training[unit, condition]]
-        evidence = Evidence.of(factor, models, parameters[unit]).part(chosen)
+        evidence = Evidence.of(factor, models, values[unit]).part(chosen)
         known = recorded.same_recordings(factor)
         if unit in recorded.units and unit not in known and not same_unit:
             other = "the study has a unit of this name, with other recordings"
@@ -201,7 +199,6 @@ def monitored(recordings: FieldRecordings) -> Rows:
             "status": Status.OUTLIER if outlier else Status.CANNOT_TELL,
             "missing": missing,
             "level_db": level,
-            "level_rate": monitor and monitor.false_alarm_rate,
             "level_units": monitor and monitor.units,
             "recorded_s": samples * population.sample_period_s,
             "samples": counts,

@@ -19,7 +19,7 @@ def compared(study: ByName, facts: Facts) -> dict[str, ByName]:
     verdict, errors = judge(facts), Record()
     for table in facts.tables:
         for name, cells in table.cells.items():
-            for channel in table.hidden(name):
+            for channel in (c for c in table.hidden if c in cells):
                 errors[f"{name}: {channel}, {table.condition}"] = cells[channel].shown
                 errors[f"{name}: {channel}, {table.condition}, worst unit"] = cells[channel].worst
     return {

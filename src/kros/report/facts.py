@@ -65,10 +65,10 @@ class ErrorTable:
     cells: Mapping[str, Mapping[str, ErrorCell]]
     measured: Names = ()
 
-    def hidden(self, observer: str | None = None) -> list[str]:
-        """Return the channels that are not measured and that an observer estimates, or any does; else all of them."""
-        estimated = self.cells.values() if observer is None else [self.cells.get(observer, {})]
-        known = dict.fromkeys(c for channels in estimated for c in channels)
+    @property
+    def hidden(self) -> list[str]:
+        """Channels that are estimated and not measured; all where all are measured."""
+        known = dict.fromkeys(c for channels in self.cells.values() for c in channels)
         return [c for c in known if c not in self.measured] or list(known)
 
     def mean(self, observer: str, channels: Sequence[str]) -> float:
@@ -171,7 +171,7 @@ class Facts:
     @property
     def hidden(self) -> list[str]:
         """Channels that the deployed observer estimates and that are not measured."""
-        return self.table.hidden(self.deployed)
+        return self.table.hidden
 
     def unit(self, channel: str) -> str:
         """Return the unit of measure of a channel; nothing where there is none."""

@@ -87,7 +87,7 @@ def _table(
 ) -> Table | None:
     """Return errors of all hidden channels, a row an observer and condition."""
     columns = list(about)
-    for channel in dict.fromkeys(c for table in tables for c in table.hidden()):
+    for channel in dict.fromkeys(c for table in tables for c in table.hidden):
         unit = facts.unit(channel)
         titles = {"mean": "mean (%)", "worst": "worst (%)", "rms": f"RMS ({unit})" if unit else "RMS"}
         titles |= {"true_error_percent": "against the true signal (%)", "lag": "lag (ms)"}
@@ -100,7 +100,7 @@ def _table(
 def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
     """Return the few observers that answer most questions, each with the roles it is compared in."""
     table, entries = facts.tables[0], facts.observers
-    channels = table.hidden()
+    channels = table.hidden
     designed = [n for n in table.cells if not label_of(n).baseline]
     certified = [n for n in designed if entries.get(n, {}).get("worst_case_h2") is not None]
     certified = certified or [n for n in designed if entries.get(n, {}).get("set_certified")]

@@ -47,7 +47,7 @@ def _version(name: str, otherwise: str) -> str:
 
 def ranking(facts: Facts) -> list[str]:
     """Return one line an observer, the smallest error of the hidden channels first."""
-    table, hidden = facts.table, facts.table.hidden()
+    table, hidden = facts.table, facts.table.hidden
     rows = list[Sequence[Any]]()
     for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
         means = {channel: cell.shown for channel, cell in table.cells[name].items()}

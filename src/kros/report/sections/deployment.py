@@ -27,18 +27,16 @@ def deployment(facts: Facts) -> Section | None:
         return None
     about = label_of(facts.deployed).about
     about = f": {about}" if about else ""
-    assumed = "; ".join(facts.entry.get("assumptions") or ())
     entry = facts.get("deployment")
     card = [
         ("Observer", [f"{facts.label}{about} (observers/deployed.json)."]),
         *(_interface(facts, entry) if entry else []),
-        ("Certificate assumes", [f"{assumed[0].upper()}{assumed[1:]}."] if assumed else []),
         ("Next unit", _next_unit(facts.get("next_unit"))),
         ("Monitor", _monitor(facts.entry.get("monitor"))),
     ]
     table = _needed(facts, entry)
     texts = [_GAINS] if table is not None else []
-    return Section("deployment", "Deployment", texts, [(term, of) for term, of in card if of], [table])
+    return Section("deployment", "Deployment", texts, card, [table])
 
 
 def _needed(facts: Facts, entry: ByName) -> Table | None:
@@ -71,19 +69,19 @@ def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
         ("Reads", [f"Measured: {named(entry['measured'])}. Inputs: {named(entry['inputs'])}."]),
         ("Estimates", [f"{joined(hidden)}, for the next sample; {delay}."]),
         ("Rate", [f"One step every {dt:g} s ({1 / dt:g} Hz), {entry['states']} states."]),
-        ("Parameters", _parameters(entry["parameters"], bool(facts.get("calibration")))),
+        ("Parameters", _parameters(entry["parameters"])),
         ("Sensor", [f"Assumed for {facts.axis(n)}: {text}." for n, text in assumed.items() if text]),
     ]
 
 
-def _parameters(parameters: Mapping[str, float | None], calibrated: bool) -> list[str]:
+def _parameters(parameters: Mapping[str, float | None]) -> list[str]:
     """Say which numbers every unit needs, and how they are obtained."""
     if not parameters:
         return []
     values = joined([f"{n} ({number(value)} on the nominal unit)" for n, value in parameters.items()])
     first = next(iter(parameters))
-    how = f", from recordings at constant speed in both directions, or --track {first}" if calibrated else ""
-    return [f"{values}; every unit has its own value: --parameter UNIT.{first}=VALUE{how}."]
+    how = f"--parameter UNIT.{first}=VALUE, from recordings at constant speed in both directions, or --track {first}"
+    return [f"{values}; every unit has its own value: {how}."]
 
 
 def _next_unit(entry: ByName | None) -> list[str]:

@@ -176,7 +176,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
     """Return a row for every unit and condition without recorded hidden channels: the monitor's level decides."""
     population, observer, rows = recordings.population, recordings.observer, Rows()
     missing = [name for name in observer.recorded if name not in population.states]
-    monitor = observer.monitor
+    monitor, units = observer.monitor, observer.monitor.units if observer.monitor else 0
     for unit, condition, keys in population.groups():
         counts, judged, samples = Counter[str](), Judged(), 0
         for arrived in map(recordings.arriving, keys):
@@ -188,7 +188,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
         level = None
         if monitor is not None and any(good.any() for _, good in judged):
             level = float(monitor.level(np.concatenate(monitor.in_turn(judged))).max())
-        outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
+        outlier = units >= FEWEST_UNITS and level is not None and level > 0
         row = {
             **dict.fromkeys(("score", "threshold", "detectable")),
             "unit": unit,
@@ -199,7 +199,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
             "status": Status.OUTLIER if outlier else Status.CANNOT_TELL,
             "missing": missing,
             "level_db": level,
-            "level_units": monitor and monitor.units,
+            "level_units": units,
             "recorded_s": samples * population.sample_period_s,
             "samples": counts,
             "parameters": recordings.sources.get(unit),

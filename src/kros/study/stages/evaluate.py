@@ -38,8 +38,8 @@ def run(context: Context) -> None:
     at_home = replace(episodes, keys=tuple(k for k in keys if k.condition == facts.identify_on))
     models = [partial(at_home.models, identified.models(name)) for name in identified.kinds]
     simulated = context.work.begin("evaluate", models)
-    pooled = {u: "off_nominal" for u in facts.pooled} | {context.uncertain.nominal: "nominal"}
-    roles = {u: pooled.get(u, "outlier") for u in facts.groups}
+    roles = dict.fromkeys(facts.groups, "outlier") | dict.fromkeys(facts.pooled, "off_nominal")
+    roles[context.uncertain.nominal] = "nominal"
     results, content = judged(context, episodes, roles)
     free_runs = dict(zip(identified.kinds, simulated(), strict=True))
     content |= {

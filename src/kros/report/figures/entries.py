@@ -35,7 +35,7 @@ def differing(residuals: UnitResiduals) -> list[int]:
     return [k for k in residuals.rows(inside=True) if residuals.unit_ids[k] != residuals.nominal_id]
 
 
-def entries_figure(run: RunFolder, residuals_of: Mapping[str, UnitResiduals], alarm: str | None = None) -> Figure:
+def entries_figure(run: RunFolder, residuals_of: Mapping[str, UnitResiduals]) -> Figure:
     """Draw entries of all units with their bound and its fit, models one below the other."""
     sizes = [np.minimum(residuals.largest.shape[1:], DRAWING.states) for residuals in residuals_of.values()]
     figure, axes = grid(sum(p for p, _ in sizes), max(m for _, m in sizes), sharex=True, sharey=True)
@@ -44,14 +44,14 @@ def entries_figure(run: RunFolder, residuals_of: Mapping[str, UnitResiduals], al
     top = 0
     for (name, residuals), (p, m) in zip(residuals_of.items(), sizes, strict=True):
         names = entry_names(residuals.form, run.models[name])
-        _draw_block(axes[top : top + p, :m], residuals, names, model_label(name), alarm)
+        _draw_block(axes[top : top + p, :m], residuals, names, model_label(name))
         top += p
     legend(axes[0, 0])
     return figure
 
 
-def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, alarm: str | None) -> None:
-    """Draw the entries of one kind of model."""
+def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str) -> None:
+    """Draw the entries of one kind of model; the first unit that is not covered is in the colour of alarm."""
     inside, freqs = differing(residuals), residuals.freqs_hz
     levels, bound, fitted = decibel(residuals.entries), decibel(residuals.largest), decibel(residuals.entry_weights)
     for i, row in enumerate(block):
@@ -60,9 +60,9 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
             lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE, "units")
             panel.plot(freqs, bound[:, i, j], color=Tone.BLUE, lw=DRAWING.broad, alpha=DRAWING.shade, label="largest")
             panel.plot(freqs, fitted[:, i, j], color=Tone.INK, label="fitted weight")
-            if alarm in residuals.unit_ids:
-                line = levels[residuals.unit_ids.index(str(alarm)), ..., i, j]
-                panel.plot(freqs, line, color=Tone.ALARM, label=f"unit {alarm}")
+            for unit in residuals.outside[:1]:
+                line = levels[residuals.unit_ids.index(unit), ..., i, j]
+                panel.plot(freqs, line, color=Tone.ALARM, label=f"unit {unit}")
             frequency_axis(panel, freqs)
             note(panel, f"order {residuals.entry_orders[i, j]}", (0, 0), (3, 3), color=Tone.SOFT)
         row[0].set_ylabel(f"to\n{short(names[0][i])}\n(dB)")

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from ...core import AnyArray, ConfigError, frozen
-from ...data import Channel, EpisodeBatch, EpisodeKey, Population, Role
+from ...data import Channel, Role
 from ...evaluate import fit_percent
 from ...evaluate.errors import error_spectrum
 from ...evaluate.held_out import HeldOut
-from ...evaluate.sensor import as_shown
 from ...identify import IdentifiedModels
-from ...observer import run_observer
+from ...observer import Sensors
 from ..canvas import Axes, Captioned, Figure, frequency_axis, grid, label_below, legend, logarithmic, set_titles
 from ..names import (
     Look,
@@ -195,30 +194,31 @@ def window_of(shown: Shown) -> slice:
     return slice(begin, begin + size)
 
 
-def shown_episode(models: IdentifiedModels, unit: str | None, condition: str | None) -> EpisodeKey:
+def episode_of(
+    models: IdentifiedModels, unit: str | None, condition: str | None, sensor: Sensors | None = None
+) -> HeldOut:
     """Return the first held-out episode, else a training one, of a unit or of the pooled ones."""
     facts, where = models.facts, condition or models.facts.identify_on
     units = [u for u in models.models(models.edmd_kinds[0], condition).unit_ids if unit or u in facts.pooled]
     keys = [k for part in ("test", "train") for k in facts.keys(part, unit, where) if k.unit in units]
     if not keys:
         raise ConfigError(f"Plot: unit {unit!r} has no episode in condition {where!r} with a model; name another one.")
-    return keys[0]
+    first = tuple(keys[:1])
+    return HeldOut(models.population, first, models.parameters, first, sensor or {})
 
 
 def compare_figure(
     models: IdentifiedModels, model: str | None = None, unit: str | None = None, condition: str | None = None
 ) -> Figure:
     """Draw simulations from the first recorded states beside the recording, with their fit in percent."""
-    key = shown_episode(models, unit, condition)
+    episode = episode_of(models, unit, condition)
     names = [model] if model else sorted(models.edmd_kinds if condition else models.kinds, key=is_koopman)
-    held_out = HeldOut(models.population, (key,), models.parameters, shown=(key,))
-    batch = held_out.read([key])
-    runs = [held_out.models(models.models(name, condition)).shown[key] for name in names]
+    (key,), states = episode.keys, models.population.read_parts(episode.keys[0])[0]
+    runs = [episode.models(models.models(name, condition)).shown[key] for name in names]
     lines = {model_label(name): (values, model_look(name)) for name, values in zip(names, runs, strict=True)}
-    figure = _episode_figure(models.population, batch, lines)
+    figure = _episode_figure(episode, lines)
     figure.axes[0].set_title(f"{episode_title(key)}\n")  # above the fits, which stand beside it
-    fits = [fit_percent(values, batch.states[:, 0]) for values in runs]
-    for panel, *percent in zip(figure.axes[1::4], *fits, strict=True):
+    for panel, *percent in zip(figure.axes[1::4], *(fit_percent(values, states) for values in runs), strict=True):
         panel.set_title(f"fit {joined([number(value) for value in percent])} %")
     return figure
 
@@ -230,17 +230,16 @@ def design_figure(
     if models is None:
         raise ConfigError("Plot of a design: give models= the identified models, whose recordings it runs on.")
     observer = getattr(design, "observer", design)
-    key = shown_episode(models, unit, condition)
-    batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
-    y = as_shown(batch, observer.sensor, models.population.states).measurements(observer.measured)
-    estimate = run_observer(observer, y, batch.inputs, batch.parameters or None)[:, 0]
-    lines = {observer_label(observer.name): (estimate, observer_look(observer.name))}
-    return _episode_figure(models.population, batch, lines)
+    episode = episode_of(models, unit, condition, observer.sensor)
+    (outcome,) = episode.observers([observer])
+    return _episode_figure(
+        episode, {observer_label(observer.name): (outcome.shown[episode.keys[0]], observer_look(observer.name))}
+    )
 
 
-def _episode_figure(population: Population, batch: EpisodeBatch, lines: Lines) -> Figure:
+def _episode_figure(episode: HeldOut, lines: Lines) -> Figure:
     """Draw all states of one episode beside what was estimated or simulated."""
-    (key,), states = batch.keys, batch.states[:, 0]
-    shown = Shown(key, batch.sample_period_s, states, batch.inputs[:, 0])
-    block = Block(episode_title(key), shown, lines, range(states.shape[1]))
+    (key,), population = episode.keys, episode.population
+    shown = Shown(key, population.sample_period_s, *population.read_parts(key))
+    block = Block(episode_title(key), shown, lines, range(len(population.states)))
     return blocks_figure(population.channels, [block])

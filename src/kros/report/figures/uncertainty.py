@@ -150,9 +150,8 @@ def weights_entrywise(run: RunFolder) -> Captioned:
 def outlier_residuals(run: RunFolder) -> Captioned:
     """Draw the residual of the highest-scoring unit beside those of the others (the paper's Figure 15)."""
     first = next(iter(run.others.values()))
-    unit = first.outside[0]
     text = f"Entries of the {words(first.form.value)} residuals relative to unit {first.nominal_id}, weights fitted to "
-    return entries_figure(run, run.others, alarm=unit), text + f"all units but {unit}."
+    return entries_figure(run, run.others), text + f"all units but {first.outside[0]}."
 
 
 def sets_figure(models: UncertainModels, model: str | None = None) -> Figure:

@@ -22,7 +22,6 @@ from .errors import (
 from .files import did_you_mean, is_file, read_toml, require_regular, shortened, stamp_of, whole_folder, write_bytes
 from .lti import StateSpace, block_diagonal, gain
 from .norms import h2_norm, hinf_norm
-from .removed import refusing
 from .rounding import AGREED, EPS, ITERATED, ROUNDING, SINGULAR, TINY
 from .settings import Settings, member, require_kind
 from .work import Executor, Progress, Work, grouped
@@ -41,5 +40,3 @@ __all__ = [
     "h2_norm",
     "hinf_norm",
 ]
-
-__getattr__ = refusing(__name__)

@@ -11,7 +11,6 @@ from . import limits
 from .arrays import T
 from .errors import ConfigError
 from .files import did_you_mean, shortened
-from .removed import instead_of
 
 E = TypeVar("E", bound=Enum)
 _OF_FAMILIES = (TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError)  # their arguments
@@ -48,13 +47,10 @@ class Settings(BaseModel):
 
     @classmethod
     def _explain(cls, error: Any) -> str:
-        key, value = ".".join(p for p in error["loc"] if isinstance(p, str)), error.get("input")
-        unknown, text = error["type"] == "extra_forbidden", error["msg"].removeprefix("Value error, ")
-        if reason := instead_of(key if unknown else f"{key}={value}"):
-            return reason
-        if unknown:
+        if error["type"] == "extra_forbidden":
             known = cls._names_in(error["loc"][:-1])
             return f"unknown key{did_you_mean(error['loc'][-1], known) or ';'} known are {', '.join(known)}"
+        text, value = error["msg"].removeprefix("Value error, "), error.get("input")
         text = text[:1].lower() + text[1:]
         return text if isinstance(value, dict) else f"{text}, found {shortened(repr(value))}"
 

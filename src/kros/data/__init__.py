@@ -13,7 +13,6 @@ Examples
 (('angle',), (50, 3))
 """
 
-from ..core import refusing
 from . import steps
 from .batch import EpisodeBatch
 from .population import (
@@ -51,4 +50,3 @@ __all__ = [
     "steps",
     "write_parquet",
 ]
-__getattr__ = refusing(__name__)

@@ -29,12 +29,11 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import ConfigDict
 
-from ..core import Array, ConfigError, DataError, Names, did_you_mean, limits, refusing
+from ..core import Array, ConfigError, DataError, Names, did_you_mean, limits
 from .population import Channel, Channels, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim"]
-__getattr__ = refusing(__name__)
 
 GAP = 10.0  # median steps of time that a straight line bridges
 PASSBAND = 0.8  # of a filter that makes the rate fall, as a share of the new Nyquist frequency

@@ -9,10 +9,7 @@ Examples
 [[2.5]]
 """
 
-from ..core import refusing
 from .errors import error_percent, fit_percent
 from .over_units import unit_interval
 
 __all__ = ["error_percent", "fit_percent", "unit_interval"]
-
-__getattr__ = refusing(__name__)

@@ -15,12 +15,9 @@ Examples
 True
 """
 
-from ..core import refusing
 from .c99.compiled import CompiledObserver
 from .c99.numbers import LoadOutput
 from .c99.write import export_c
 from .fmu.write import export_fmu
 
 __all__ = ["CompiledObserver", "LoadOutput", "export_c", "export_fmu"]
-
-__getattr__ = refusing(__name__)

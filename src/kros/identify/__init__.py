@@ -13,7 +13,6 @@ Examples
 import sys
 from types import ModuleType
 
-from ..core import refusing
 from .calibration import PhaseCalibration, PhaseSpec
 from .edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from .factors import Factor, combine, unit_factors
@@ -45,5 +44,3 @@ class _CallablePackage(ModuleType):
 
 
 sys.modules[__name__].__class__ = _CallablePackage
-
-__getattr__ = refusing(__name__)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..core.removed import lazy_names
+from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .control import from_control, to_control
@@ -22,4 +22,4 @@ if TYPE_CHECKING:
 __all__ = ["KoopmanRegressor", "from_control", "to_control"]
 
 _HOME = dict.fromkeys(__all__, "control") | {"KoopmanRegressor": "sklearn_estimator"}
-__getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)
+__getattr__, __dir__ = lazy_names(__name__, _HOME)

@@ -8,9 +8,7 @@ Examples
 [[0.0, 3.0, 0.0]]
 """
 
-from ..core import refusing
 from .families import delays, harmonics, kmeans_centres, polynomials, radial
 from .lifting import Lifting
 
 __all__ = ["Lifting", "delays", "harmonics", "kmeans_centres", "polynomials", "radial"]
-__getattr__ = refusing(__name__)

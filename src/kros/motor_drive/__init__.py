@@ -10,8 +10,6 @@ Examples
 0.9999
 """
 
-from ..core import refusing
 from .level import AngleLoad
 
 __all__ = ["AngleLoad"]
-__getattr__ = refusing(__name__)

@@ -11,7 +11,6 @@ Examples
 [0.5, 0.25]
 """
 
-from ..core import refusing
 from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
 from .estimator.build import identify_estimator
@@ -43,5 +42,3 @@ __all__ = [
     "relift_certificate",
     "run_observer",
 ]
-
-__getattr__ = refusing(__name__)

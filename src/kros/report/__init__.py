@@ -13,7 +13,3 @@ Examples
 >>> motors.plot().axes[0].get_xscale()
 'linear'
 """
-
-from ..core import refusing
-
-__getattr__ = refusing(__name__)

@@ -9,10 +9,7 @@ Examples
 ('auto', 0.95)
 """
 
-from ..core import refusing
 from .config import Stage, StudyConfig, load_config, validate_config
 from .pipeline import RunResult, run
 
 __all__ = ["RunResult", "Stage", "StudyConfig", "load_config", "run", "validate_config"]
-
-__getattr__ = refusing(__name__)

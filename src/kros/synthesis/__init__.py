@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..core.removed import lazy_names
+from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
@@ -53,4 +53,4 @@ __all__ = [
     "worst_case_h2",
 ]
 
-__getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)
+__getattr__, __dir__ = lazy_names(__name__, _HOME)

@@ -12,7 +12,6 @@ Examples
 ('1', True)
 """
 
-from ..core import refusing
 from ..core.linalg import sigma_max
 from .bounded import choose_nominal
 from .forms import Form, misfit, rebuild, residual
@@ -36,5 +35,3 @@ __all__ = [
     "score_outliers",
     "sigma_max",
 ]
-
-__getattr__ = refusing(__name__)

@@ -7,9 +7,7 @@ Examples
 True
 """
 
-from ...core import refusing
 from .population import refine_population
 from .search import GaussNewton, RefineOptions
 
 __all__ = ["GaussNewton", "RefineOptions", "refine_population"]
-__getattr__ = refusing(__name__)

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from kros.core.errors import IdentificationError
 from kros.data import prepare
 from kros.data.prepare import scale_population
 from kros.data.recording import check_episode, is_constant
 from kros.data.steps import Step
 from kros.identify import Factor, PhaseSpec, combine, edmd
 from kros.identify.calibration import find_segments
-from kros.identify.factors import Ranges, lifted_factor, reduce_episode, require_excitation
+from kros.identify.factors import Ranges, lifted_factor, reduce_episode
 from kros.identify.refine import RefineOptions, refine_population
 from kros.lifting import Lifting
 from kros.plants import DcMotorPopulation, HarmonicDrivePopulation
@@ -129,12 +128,3 @@ def test_a_constant_is_a_constant_in_any_unit():
     moving[700] *= 1 + 1e-10
     for factor in (1e-9, 1.0, 1e9):
         assert not is_constant(factor * moving)
-
-
-@pytest.mark.parametrize("factor", [1e-9, 1.0, 1e9])
-def test_an_input_that_rests_but_for_rounding_is_refused(factor):
-    span = factor * np.array([[[0.1], [0.1 * (1 + 3e-16)]]])
-    held = Factor(np.eye(3)[None], np.ones((1, 2)), np.array([10]), span)
-    with pytest.raises(IdentificationError, match="constant"):
-        require_excitation(held, ("voltage",), ("001",), "default")
-    require_excitation(replace(held, input_range=span * np.array([[1.0], [1.01]])), ("voltage",), ("001",), "default")

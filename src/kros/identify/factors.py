@@ -18,13 +18,12 @@ the ranges of the lifted states and of the inputs as diagonal matrices X and U, 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..core import ROUNDING, Array, ArrayLike, DataError, IdentificationError, Whole, frozen
+from ..core import Array, ArrayLike, DataError, IdentificationError, Whole, frozen
 from ..core.linalg import qr_triangle
 from ..data import EpisodeKey, Population
 from ..data.recording import usable
@@ -34,7 +33,6 @@ from .edmd import KoopmanMatrices, edmd
 
 Task = tuple[Population, Sequence[EpisodeKey], Lifting]  # episodes of one unit
 
-log = logging.getLogger(__name__)
 _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
 
 
@@ -55,7 +53,6 @@ class Factor:
     R: Array  # (..., n_columns, n_columns)
     peak: Array  # (..., n + n_basis + m + n_input_basis), largest magnitude of every column at k
     n_samples: Whole  # (...)
-    input_range: Array | None = None  # (..., 2, m), smallest and largest value of every recorded input
 
     def __getitem__(self, rows: Any) -> Factor:
         """Return some factors of a batch."""
@@ -79,10 +76,7 @@ def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
         raise DataError(f"{wrong[0]} is not finite, or huge; use functions that are moderate on all recordings.")
     now = np.concatenate([x.T, g.T, u.T, v.T])  # a signal a row: extremes and reflections run along memory
     data = np.concatenate([now[:, :-1], now[: x.shape[1] + g.shape[1], 1:]])
-    least, most, inputs = now.min(axis=1), now.max(axis=1), slice(x.shape[1] + g.shape[1], now.shape[0] - v.shape[1])
-    return Factor(
-        triangular(data.T), np.maximum(most, -least), np.asarray(data.shape[1]), np.stack([least[inputs], most[inputs]])
-    )
+    return Factor(triangular(data.T), np.maximum(now.max(axis=1), -now.min(axis=1)), np.asarray(data.shape[1]))
 
 
 def triangular(rows: Array) -> Array:
@@ -105,9 +99,7 @@ def combine(factors: Factor) -> Factor:
     """
     *batch, episodes, width, _ = factors.R.shape
     stacked = factors.R.reshape(*batch, episodes * width, width)
-    ends = factors.input_range
-    span = None if ends is None else np.stack([ends[..., 0, :].min(axis=-2), ends[..., 1, :].max(axis=-2)], axis=-2)
-    return Factor(qr_triangle(stacked), factors.peak.max(axis=-2), factors.n_samples.sum(axis=-1), span)
+    return Factor(qr_triangle(stacked), factors.peak.max(axis=-2), factors.n_samples.sum(axis=-1))
 
 
 def reduce_episodes(task: Task) -> Factor:
@@ -151,7 +143,7 @@ def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array]
     change[..., :now, :lifted] = change[..., wide:, width:] = theta
     change[..., now:wide, lifted:width] = inputs
     peak = np.concatenate([peak, of_inputs], axis=-1)
-    return Factor(qr_triangle(factor.R @ change), peak, factor.n_samples, factor.input_range)
+    return Factor(qr_triangle(factor.R @ change), peak, factor.n_samples)
 
 
 def _widened(
@@ -168,25 +160,14 @@ def _widened(
     return change, np.concatenate([peak[..., :n], np.einsum("...ij,...j->...i", np.abs(M), peak[..., n:])], axis=-1)
 
 
-def require_excitation(
-    factor: Factor, inputs: Sequence[str], units: Sequence[str], where: str, alpha: float = 0.0
-) -> None:
-    """Refuse inputs that are constant over all training episodes of a unit."""
-    if factor.input_range is None:
-        return
-    low, high = factor.input_range[..., 0, :], factor.input_range[..., 1, :]
-    still = high - low <= ROUNDING * np.maximum(np.abs(low), np.abs(high))
-    dead = [name for name, zero in zip(inputs, np.all(still & (low == 0), axis=0), strict=True) if zero]
-    for i, j in np.argwhere(still):
-        kind = "zero" if low[i, j] == 0 else "constant"
-        problem = f"unit {units[i]} ({where}): input {inputs[j]!r} is {kind} ({low[i, j]:g}) over all training episodes"
-        if not alpha or inputs[j] in dead:
-            zero = "declare it as another role or drop the channel"
-            remedy = zero if inputs[j] in dead else "excite it, drop the channel, or use alpha > 0"
-            raise IdentificationError(
-                f"Identifying {problem}, so the response to it is not in the recordings; {remedy}."
-            )
-        log.warning("%s; its column of B is that of an offset, shrunk by alpha = %g", problem, alpha)
+def require_excitation(factor: Factor, inputs: Sequence[str], where: str) -> None:
+    """Refuse recorded inputs that are zero in all training episodes of linear models."""
+    at_rest = factor.peak.max(axis=0)[-len(inputs) :] == 0
+    if at_rest.any():
+        raise IdentificationError(
+            f"Identifying ({where}): input {inputs[int(at_rest.argmax())]!r} is zero in all training episodes, so the "
+            "response to it is not in the recordings; declare it as another role, or drop the channel."
+        )
 
 
 @frozen
@@ -222,7 +203,7 @@ class Ranges:
         return R / np.concatenate([self.outputs, self.inputs, self.outputs])
 
     def factor(self, factor: Factor) -> Factor:
-        """Return factors of channels divided by the ranges, without the values of inputs."""
+        """Return factors of channels divided by the ranges."""
         peak = factor.peak / np.concatenate([self.outputs, self.inputs])
         return Factor(self.triangles(factor.R), peak, factor.n_samples)
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Flags, IdentificationError, Work, digest_of, frozen, require_kind
+from ..core import Array, Flags, IdentificationError, Record, Work, digest_of, frozen, require_kind
 from ..core.linalg import radius_text
 from ..data import Population
 from ..lifting import Lifting
@@ -179,10 +179,11 @@ class _Reduced:
 
     def identify(self, settings: IdentifySettings) -> list[ModelSet]:
         """Identify every kind of model with one common regularisation."""
-        sets = [self._unfitted(*kind) for kind in kinds_for(self.base.lifting, refined=False).items()]
-        factors = [self.lifted(m.lifting) for m in sets]
-        alpha = self._search(sets, factors, settings) if settings.alpha == "auto" else float(settings.alpha)
-        require_excitation(self.factor, self.base.population.inputs, self.units, self.condition, alpha)
+        kinds = kinds_for(self.base.lifting, refined=False)
+        factors = [self.lifted(lifting) for lifting in kinds.values()]
+        require_excitation(factors[-1], self.base.population.inputs, self.condition)
+        sets = [self._unfitted(*kind, factor) for kind, factor in zip(kinds.items(), factors, strict=True)]
+        alpha = self._search(sets, factors) if settings.alpha == "auto" else settings.alpha
         sets = [replace(m, alpha=alpha, alpha_in_ranges=settings.alpha == "auto") for m in sets]
         models = [fitted(m, factor) for m, factor in zip(sets, factors, strict=True)]
         for m in models if self.feeds_synthesis else ():
@@ -194,9 +195,8 @@ class _Reduced:
                     )
         return models
 
-    def _unfitted(self, kind: str, lifting: Lifting) -> ModelSet:
-        population = self.base.population
-        ranges = Ranges.of(self.lifted(lifting), lifting.n_lifted, self.rows)
+    def _unfitted(self, kind: str, lifting: Lifting, factor: Factor) -> ModelSet:
+        population, ranges = self.base.population, Ranges.of(factor, lifting.n_lifted, self.rows)
         nothing = np.zeros((len(self.units), 0, 0))
         return ModelSet(
             name=kind,
@@ -212,12 +212,11 @@ class _Reduced:
             input_scale=ranges.inputs,
         )
 
-    def _search(self, sets: list[ModelSet], factors: list[Factor], settings: IdentifySettings) -> float:
+    def _search(self, sets: list[ModelSet], factors: list[Factor]) -> float:
         """Return the common regularisation of channels divided by their ranges."""
         pairs = zip(sets, factors, strict=True)
         shared = [(m.ranges.triangles(factor.R[self.rows]), m.lifting.n_lifted) for m, factor in pairs]
-        edge = smallest_stabilising_alpha(shared)
-        search = AlphaSearch()
+        edge, search = smallest_stabilising_alpha(shared), AlphaSearch()
         times = search.factor
         for factor in times * 2.0 ** np.arange(search.doublings if self.feeds_synthesis and edge > 0 else 0):
             models = [edmd(R, n, factor * edge) for R, n in shared]
@@ -240,12 +239,12 @@ class _Reduced:
             )
             for m in starts
         ]
-        results, fine = work.begin("identify (refine)", tasks), ("ok",) * len(self.units)
-        starts = [replace(start, alpha=None, alpha_in_ranges=False, status=fine) for start in starts]
+        results = work.begin("identify (refine)", tasks)
+        known: Record = {"alpha": None, "alpha_in_ranges": False, "status": ("ok",) * len(self.units)}
 
         def refining() -> list[ModelSet]:
             of = zip(kinds_for(base.lifting, refined=True), starts, results(), strict=True)
-            return [replace(start, name=kind, A=m.A, B=m.B) for kind, start, m in of]
+            return [replace(start, name=kind, A=m.A, B=m.B, **known) for kind, start, m in of]
 
         return refining
 
@@ -254,7 +253,5 @@ def fitted(models: ModelSet, factor: Factor) -> ModelSet:
     """Return a set of models fitted to factors of its units, with its regularisation."""
     matrices = models.fit(factor.R)
     models = replace(models, A=matrices.A, B=matrices.B)
-    radii = models.spectral_radius()
-    return replace(
-        models, status=tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radii)
-    )
+    unstable = (f"unstable, spectral radius {radius_text(r)}" if r >= 1 else "ok" for r in models.spectral_radius())
+    return replace(models, status=tuple(unstable))

@@ -182,7 +182,10 @@ def test_columns_of_another_type(stored: Path, kind: Any) -> None:
         return table.set_column(at, "v", table["v"].cast(kind, safe=False))
 
     rewrite(stored / "a@default.parquet", change)
-    with pytest.raises(DataError, match=r"a@default\.parquet: column 'v' should hold numbers of type double"):
+    with pytest.raises(
+        DataError,
+        match=r"a@default\.parquet: row group 0 should hold .* as double, found .*\b(halffloat|float|string|int64)",
+    ):
         scan_digests(read_parquet(stored))
 
 
@@ -193,7 +196,7 @@ def test_labels_that_disagree_with_the_index(stored: Path, label: str) -> None:
         return table.set_column(at, label, pa.array([*["other"] * 5, *table[label].to_pylist()[5:]]))
 
     rewrite(stored / "a@default.parquet", change)
-    with pytest.raises(DataError, match=r"the index says episode 0 of unit a \(default\), the samples do not"):
+    with pytest.raises(DataError, match=r"80 samples of episode 0 of unit a \(default\) .* found 80 of .*'other'"):
         scan_digests(read_parquet(stored))
 
 

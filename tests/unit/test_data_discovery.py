@@ -194,7 +194,7 @@ def test_lines_before_the_numbers(tmp_path: Path):
     path.write_text("; Bench 4\n# rate 1000 Hz\ntime;speed\n[s];[rpm]\nfloat;float\n0,001;1,5\n0,002;2,5\n0,003;2,5\n")
     head = look_at(path)
     assert head.fields == ("time", "speed")
-    assert head.units == ("[s]", "[rpm]")
+    assert head.units == ("s", "rpm")
     assert (head.dialect.delimiter, head.dialect.decimal, head.dialect.skip_rows, head.dialect.unit_rows) == (
         ";",
         ",",

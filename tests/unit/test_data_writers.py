@@ -154,7 +154,7 @@ def test_damaged_folders(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="not as kros writes it"):
         read_parquet(out)
     index.write_text(edited.replace("   20,", "   25,"))
-    with pytest.raises(DataError, match="25 samples are expected in row group 0, found 20"):
+    with pytest.raises(DataError, match=r"row group 0 should hold 25 samples .* found 20 of"):
         read_parquet(out).read(EpisodeKey("a", "cold", "0"))
     index.write_text(good)
     (out / "b@warm.parquet").write_bytes((out / "b@warm.parquet").read_bytes()[:200])

@@ -57,12 +57,16 @@ class Recording:
         return replace(self, values=self.values[start:stop], time_s=time)
 
     def distinct(self) -> Recording:
-        """Return the same without samples that repeat time and all values of those before, as late loggers write."""
-        if self.time_s is None:
+        """Return the same without samples that repeat the stamp before them.
+
+        They do so with all values, as late loggers write, or at the end, as stopped recorders write.
+        """
+        time, x = self.time_s, self.values
+        if time is None:
             return self
-        again = 1 + np.flatnonzero(np.diff(self.time_s) == 0)
-        drop = [k for k in again if np.array_equal(self.values[k], self.values[k - 1], equal_nan=True)]
-        return replace(self, values=np.delete(self.values, drop, axis=0), time_s=np.delete(self.time_s, drop))
+        again = 1 + np.flatnonzero(np.diff(time) == 0)
+        drop = [k for k in again if time[k] == time[-1] or np.array_equal(x[k], x[k - 1], equal_nan=True)]
+        return replace(self, values=np.delete(x, drop, axis=0), time_s=np.delete(time, drop))
 
     def usable(self, period_s: float) -> Recording:
         """Return the same without samples that hold NaN or infinity, with the time of the others, if two remain."""
@@ -71,12 +75,6 @@ class Recording:
         even = np.arange(len(self.values), dtype=np.float64) * period_s
         time = even if self.time_s is None else self.time_s
         return replace(self, values=self.values[usable_rows], time_s=time[usable_rows])
-
-    def ended(self) -> Recording:
-        """Return the same without a last sample that repeats the stamp before it, as stopped recorders write."""
-        time = self.time_s
-        repeated = time is not None and len(time) > 1 and time[-1] == time[-2]
-        return self.cut(0, len(self.values) - 1) if repeated else self
 
 
 @frozen
@@ -90,7 +88,7 @@ class Recordings:
         if key not in self.places:
             others = f"this source has {len(self.places)} other episodes"
             raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
-        return self.read(key).distinct().ended()
+        return self.read(key).distinct()
 
     def read(self, key: EpisodeKey) -> Recording:
         """Return one episode as recorded."""
@@ -213,14 +211,10 @@ def is_constant(column: Array) -> bool:
 def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int) -> None:
     """Raise NonFiniteError where a channel holds NaN, infinity or what is as good as that."""
     for channel, signal in zip(channels, values.T, strict=True):
-        kinds = {
-            "NaN": np.isnan(signal),
-            f"above {limits.MAX_VALUE:g}": ~usable(signal) & np.isfinite(signal),
-            "infinity": np.isinf(signal),
-        }
         bad = np.flatnonzero(~usable(signal))
         if bad.size:
-            what = " and ".join(kind for kind, places in kinds.items() if places.any())
+            kinds = {"NaN": np.isnan, f"above {limits.MAX_VALUE:g}": np.isfinite, "infinity": np.isinf}
+            what = " and ".join(kind for kind, is_so in kinds.items() if is_so(signal[bad]).any())
             where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
             bridge = 'bridge short gaps by [[data.prepare]] step = "resample"'
             advice = f'fix the source, {bridge}, or set data.on_nan = "drop_episode"'

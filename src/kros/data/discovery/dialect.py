@@ -28,7 +28,7 @@ _NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
 
 @dataclass(frozen=True)
 class TableHead(Table):
-    """A table with the cells of its first rows of numbers; its fields are their numbers where there is no header."""
+    """A table with the cells of its first rows of numbers."""
 
     rows: tuple[Names, ...]
 
@@ -123,13 +123,9 @@ def _described(path: Path, rows: list[list[str]], dialect: Dialect) -> TableHead
     cells = tuple(tuple(rows[i]) for i in data if i >= first)[: RULE.rows]
     written = sum(bool(c) for c in cells[0])
     above = [i for i in range(first) if 2 * sum(map(bool, rows[i])) >= written and abs(len(rows[i]) - width) <= 1]
-    blank = ("",) * width
-    if not above:
-        numbers = tuple(str(i + 1) for i in range(width))
-        bare = dialect.model_copy(update={"header": False, "skip_rows": first})
-        return TableHead(path, bare, numbers, blank, cells)
-    unit_row = next((i for i in above[1:] if is_unit_row(rows[i])), None)
-    header = above[-1] if unit_row is None else above[above.index(unit_row) - 1]
-    fields, units = ((*row, *blank)[:width] for row in (rows[header], () if unit_row is None else rows[unit_row]))
-    placed = dialect.model_copy(update={"skip_rows": header, "unit_rows": first - header - 1})
-    return TableHead(path, placed, fields, units, cells)
+    placed = {"header": False, "skip_rows": first}
+    if above:
+        unit_row = next((i for i in above[1:] if is_unit_row(rows[i])), None)
+        header = above[-1] if unit_row is None else above[above.index(unit_row) - 1]
+        placed = {"skip_rows": header, "unit_rows": first - header - 1}
+    return TableHead(**vars(Table.open(path, dialect.model_copy(update=placed))), rows=cells)

@@ -178,8 +178,8 @@ def load_mapping(mapping: CsvMapping | ByName | Path | str) -> CsvMapping:
 
 
 log = logging.getLogger(__name__)
-ENDINGS = (*[".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz"], *FORMATS)
 _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
+ENDINGS = (*[".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz"], *FORMATS)
 
 
 @dataclass(frozen=True)
@@ -251,22 +251,11 @@ def read_csv_folder(
             if groups.setdefault(key.unit, group) != group:
                 both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
                 raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
-    if not places:
-        raise _nothing(source, chosen)
     time_scale = None if chosen.time is None else chosen.time_scale or 1.0
     recordings = CsvRecordings(places, time_scale, chosen.timestamp)
     channels = tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in chosen.ordered)
     facts = ([Unit(unit, group) for unit, group in groups.items()], chosen.sample_period_s, chosen.metadata)
     return assemble(recordings, channels, *facts, steps=chosen.steps, scaling=chosen.scaling)
-
-
-def _nothing(source: Path, mapping: CsvMapping) -> DataError:
-    """Return why a folder has no episodes."""
-    files, left_out = list(csv_files(source)), "; exclude leaves some out" if mapping.exclude else ""
-    none = f"; there is no file that ends in {', '.join(ENDINGS[:4])}"
-    sample = f" of {len(files)} files such as {files[0]!r}" if files else none
-    actual = f"no file matches files = {mapping.files!r}{sample}{left_out}"
-    return DataError(f"Reading {source} as csv: {actual}; correct the expression.")
 
 
 def part_of(path: str, key: EpisodeKey) -> str:
@@ -310,21 +299,26 @@ def csv_files(source: Path) -> dict[str, Path]:
     return files
 
 
-def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match[str]]]:
-    """Yield the files that the mapping describes; the others are counted and named."""
-    others, matched = [], False
-    for relative, path in csv_files(source).items():
+def _matches(source: Path, mapping: CsvMapping) -> list[tuple[Path, re.Match[str]]]:
+    """Return the files that the mapping describes; the others are counted and named."""
+    files, matches, others = csv_files(source), list[tuple[Path, re.Match[str]]](), list[str]()
+    for relative, path in files.items():
         if mapping.exclude and re.search(mapping.exclude, relative):
             continue
-        match = re.search(mapping.files, relative)
-        if match:
-            matched = True
-            yield path, match
+        if match := re.search(mapping.files, relative):
+            matches.append((path, match))
         else:
             others.append(relative)
-    if others and matched:  # if none does, the error says so
+    if not matches:
+        some_file = f"there are {len(files)} files such as {next(iter(files))!r}" if files else "there is no file"
+        raise DataError(
+            f"Reading {source} as csv: no file matches files = {mapping.files!r}, {some_file} that ends in "
+            f"{', '.join(ENDINGS[:4])}; correct the expression, or exclude."
+        )
+    if others:
         text = "%d files in %s do not match files = %r and are ignored: %s."
         log.warning(text, len(others), source, mapping.files, some(others))
+    return matches
 
 
 def _places(
@@ -370,13 +364,9 @@ def _named(fields: Names, column: Column, unit: str) -> list[int]:
 
 def _position(table: Table, column: Column, unit: str = "") -> int:
     """Return the position of a column, see `_named`."""
-    fields = list(table.fields)
     places = _named(table.fields, column, unit)
     if len(places) == 1:
         return places[0]
-    problem = f"column {column!r} is missing{did_you_mean(column, fields) or ','} found {fields}"
-    if isinstance(column, int):
-        problem = f"column {column} is asked for, found {len(fields)} columns"
-    elif places:
-        problem = f"column {column!r} occurs {len(places)} times, found {fields}"
-    raise DataError(f"Reading {table.path}: {problem}; correct the mapping or the file.")
+    problem = f"occurs {len(places)} times," if places else f"is missing{did_you_mean(column, table.fields) or ','}"
+    found = f"found {list(table.fields)}; correct the mapping or the file"
+    raise DataError(f"Reading {table.path}: column {column!r} {problem} {found}.")

@@ -51,40 +51,30 @@ class ParquetRecordings(Recordings):
         return Path(self.folder) / place[0]
 
     def read(self, key: EpisodeKey) -> Recording:
-        """Return an episode."""
+        """Return an episode, pages against their checksums."""
+        from pyarrow import parquet
+
         place = self.places[key]
-        path = self.file(place)
+        path, (_, group, samples) = self.file(place), place
+        options: Record = {"pre_buffer": False, "page_checksum_verification": True, "memory_map": True}
         require_regular(path, sys.maxsize)
         try:
-            table = _table(path, place, [*KEYS, *self.columns])
+            with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:
+                table = file.read_row_group(group, columns=[*KEYS, *self.columns], use_threads=False)
             table.select(KEYS).validate(full=True)
-            if [table.column(name).unique().to_pylist() for name in KEYS] != [[name] for name in astuple(key)]:
-                raise DataError(f"Reading {path}: the index says {key}, the samples do not; {AGAIN}.")
+            labels = [table.column(name).unique().to_pylist() for name in KEYS]
+            types = {str(table.schema.field(name).type) for name in self.columns}
+            if (labels, types, len(table)) != ([[name] for name in astuple(key)], {"double"}, samples):
+                raise DataError(
+                    f"Reading {path}: row group {group} should hold {samples} samples of {key} as double, found "
+                    f"{len(table)} of {labels} as {', '.join(types)}; files were changed, {AGAIN}."
+                )
             return Recording(key, np.column_stack([to_numpy(table.column(channel)) for channel in self.columns]))
         except DataError:
             raise
         except _ARROW_ERRORS as error:
             pass_on_shortage(error, path)
             raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; {AGAIN}.") from error
-
-
-def _table(path: Path, place: Place, columns: list[str]) -> Any:
-    """Return columns of a row group after checks of length and types, pages against their checksums."""
-    from pyarrow import parquet
-
-    _, group, samples = place
-    options: Record = {"pre_buffer": False, "page_checksum_verification": True, "memory_map": True}
-    with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:
-        actual, schema = file.metadata.row_group(group).num_rows, file.schema_arrow
-        if actual != samples:
-            problem = f"{samples} samples are expected in row group {group}, found {actual}"
-            raise DataError(f"Reading {path}: {problem}; files were changed, {AGAIN}.")
-        kinds = {name: str(schema.field(name).type) for name in columns}
-        wrong = [name for name, kind in kinds.items() if not (("string" in kind) if name in KEYS else kind == "double")]
-        if wrong:
-            problem = f"column {wrong[0]!r} should hold {'text' if wrong[0] in KEYS else 'numbers of type double'}"
-            raise DataError(f"Reading {path}: {problem}, found {kinds[wrong[0]]}; files were changed, {AGAIN}.")
-        return file.read_row_group(group, columns=columns, use_threads=False)
 
 
 @lru_cache

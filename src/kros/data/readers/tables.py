@@ -48,7 +48,7 @@ class Table:
 
     path: Path
     dialect: Dialect  # of a text file
-    fields: Names  # names of the columns, or the first numbers where there is no header
+    fields: Names  # names of the columns, their numbers from 1 where there is no header
     units: Names  # units of measure that it states
 
     @classmethod
@@ -107,8 +107,7 @@ class Table:
         """Return what Arrow says about the file, with the name of a column in place of its number from zero."""
 
         def name(match: re.Match[str]) -> str:
-            at = int(match[1])
-            return f"in column {self.fields[at] if self.dialect.header else at + 1!r}:"
+            return f"in column {self.fields[int(match[1])]!r}:"
 
         pass_on_shortage(error, self.path)
         text = shortened(re.sub(r"In CSV column #(\d+):", name, str(error)))
@@ -134,6 +133,8 @@ def _columns(path: Path, dialect: Dialect) -> tuple[list[str], list[str]]:
     width = len(rows[-1]) if dialect.header and len(rows) > dialect.unit_rows else len(fields)
     spare = (*fields[width:], *(rows[-1][len(fields) :] if width > len(fields) else ()))  # of delimiters at line ends
     fields = fields if width < 2 or any(spare) else (fields + [""] * width)[:width]
+    if not dialect.header:
+        return [str(i + 1) for i in range(len(fields))], [""] * len(fields)
     units = next(filter(is_unit_row, rows[: dialect.unit_rows]), [split_header(name)[1] for name in fields])
     return fields, (units + [""] * len(fields))[: len(fields)]
 

@@ -21,6 +21,7 @@ Index = NDArray[np.intp]
 Names = tuple[str, ...]  # and other texts
 Parameters = Mapping[str, ArrayLike]  # of a lifting, by name
 Record = dict[str, Any]  # values by name, as in JSON
+Texts = dict[str, str]  # by name
 Whole = NDArray[np.int64]
 
 

@@ -27,8 +27,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..core import Array, Flags, IdentificationError, Storable, Work, digest_of
+from ..core.arrays import Texts as Texts
 from ..core.linalg import pieces
-from ..data import EpisodeKey, Population, split_episodes
+from ..data import Population, split_episodes
+from ..data.population import Keys
 from .survey import RecordingFacts
 
 log = logging.getLogger(__name__)
@@ -196,7 +198,7 @@ def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec
     return PhaseCalibration(spec, lag, {name: unit.on_branch_of(lag) for name, unit in units.items()})
 
 
-Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]
+Task = tuple[Population, Keys, PhaseSpec]
 
 
 def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work) -> PhaseCalibration:
@@ -238,17 +240,16 @@ def segments_of(task: Task) -> list[Segment]:
     return segments
 
 
-def calibration_keys(facts: RecordingFacts, unit: str) -> tuple[EpisodeKey, ...]:
+def calibration_keys(facts: RecordingFacts, unit: str) -> Keys:
     """Return the episodes that a unit is calibrated on: those of `identify_on`, or of the first condition it has."""
     every = facts.keys("train", unit)
     return facts.keys("train", unit, facts.identify_on) or tuple(k for k in every if k.condition == every[0].condition)
 
 
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
-Texts = dict[str, str]  # by unit
 
 
-def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
+def training_keys(population: Population) -> dict[tuple[str, str], Keys]:
     """Return the episodes that a unit is identified on: its training part, or its only episode."""
     groups = {(u, c): keys for u, c, keys in population.groups()}
     several = tuple(k for keys in groups.values() if len(keys) > 1 for k in keys)

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ArrayLike, DataError, IdentificationError, Whole, frozen
+from ..core import Array, ArrayLike, DataError, IdentificationError, Names, Whole, frozen
 from ..core.linalg import qr_triangle
 from ..data import EpisodeKey, Population
 from ..data.recording import usable
@@ -184,7 +184,7 @@ class Ranges:
         peak = np.where(peak > 0, peak, 1.0)
         return cls(peak[:n_lifted], peak[n_lifted:])
 
-    def sizes(self, lifting: Lifting, recorded: tuple[str, ...]) -> dict[str, float]:
+    def sizes(self, lifting: Lifting, recorded: Names) -> dict[str, float]:
         """Return the ranges by name: of states, lifted functions, recorded inputs and functions of these."""
         names = (*lifting.names, *recorded, *lifting.input_functions)
         return dict(zip(names, np.concatenate([self.outputs, self.inputs]).tolist(), strict=True))

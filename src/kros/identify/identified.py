@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 from urllib.parse import quote
 
 import numpy as np
 
-from ..core import DataError, Storable, frozen, load_artifact, loader, save_artifact
+from ..core import DataError, Names, Record, Storable, frozen, load_artifact, loader, save_artifact
 from ..data import Population, Shown
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
@@ -76,7 +76,7 @@ class IdentifiedModels(Shown):
     facts: RecordingFacts  # of the recordings, with the split into training and test
     lifting: Lifting  # of the Koopman models
     calibration: PhaseCalibration | None = None  # of the lifting's parameter, where it has one
-    kinds: tuple[str, ...] = ()  # of models: refined ones, or those of EDMD; the one that others follow comes first
+    kinds: Names = ()  # of models: refined ones, or those of EDMD; the one that others follow comes first
     sets: Mapping[str, ModelSet] = field(default_factory=dict)  # by `place`; refined ones beside their start
     factors: Mapping[str, EpisodeFactors] = field(default_factory=dict)  # by condition
 
@@ -84,10 +84,10 @@ class IdentifiedModels(Shown):
         kinds, facts = ", ".join(self.kinds), self.facts
         return f"<IdentifiedModels: {kinds} of {len(facts.pooled)} units, identified on {facts.identify_on!r}>"
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         facts = self.facts
         episodes = f"{len(facts.train)} in training, {len(facts.test)} held out, {len(facts.dropped)} left out"
-        rows: dict[str, Any] = {
+        rows: Record = {
             "units": len(facts.pooled),
             "episodes": episodes,
             "functions": ", ".join(self.lifting.functions),
@@ -96,12 +96,12 @@ class IdentifiedModels(Shown):
         return rows | {"conditions": ", ".join(self.conditions), "alerts": " ".join(facts.alerts)}
 
     @property
-    def edmd_kinds(self) -> tuple[str, ...]:
+    def edmd_kinds(self) -> Names:
         """The paper's kinds of models, in the order of `kinds`, in every condition; the first one scores outliers."""
         return tuple(kinds_for(self.lifting, refined=False))
 
     @property
-    def conditions(self) -> tuple[str, ...]:
+    def conditions(self) -> Names:
         """Conditions that models were identified in, that of synthesis first."""
         known = {k.condition for k in self.facts.train if k.unit in self.parameters}
         return tuple(sorted(known, key=lambda c: c != self.facts.identify_on))

@@ -9,14 +9,14 @@ those of the condition that feeds synthesis --refined on free-run error--> koopm
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ..core import Array, Flags, IdentificationError, Record, Work, digest_of, frozen, require_kind
+from ..core import Array, ByName, Flags, IdentificationError, Names, Record, Work, digest_of, frozen, require_kind
 from ..core.linalg import radius_text
 from ..data import Population
 from ..lifting import Lifting
@@ -36,12 +36,12 @@ log = logging.getLogger(__name__)
 
 def identify(
     population: Population,
-    lifting: Lifting | LiftingSettings | Mapping[str, Any] | Sequence[str] | None = None,
+    lifting: Lifting | LiftingSettings | ByName | Sequence[str] | None = None,
     *,
     identify_on: str | None = None,
     test: Iterable[str] | None = None,
     on_nan: str = "error",
-    calibration: PhaseCalibration | CalibrationSettings | Mapping[str, Any] | None = None,
+    calibration: PhaseCalibration | CalibrationSettings | ByName | None = None,
     work: Work | None = None,
     **settings: Any,
 ) -> IdentifiedModels:
@@ -154,7 +154,7 @@ class _Reduced:
 
     base: IdentifiedModels
     condition: str
-    units: tuple[str, ...]
+    units: Names
     factor: Factor
     parameters: dict[str, Array]
 

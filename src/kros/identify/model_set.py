@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..core import AnyArray, Array, ArrayLike, StateSpace
+from ..core import AnyArray, Array, ArrayLike, Names, Record, StateSpace
 from ..core.artifacts import Storable, divided, load_artifact, loader, save_artifact, united
 from ..core.frequency import log_grid
-from ..data import Channel, Role, Shown
+from ..data import Role, Shown
+from ..data.population import Channels
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
 from .factors import Ranges
@@ -38,9 +38,9 @@ class ModelSet(Shown, Storable):
     name: str  # kind of model, for example ``koopman_edmd``
     condition: str
     lifting: Lifting
-    channels: tuple[Channel, ...]
+    channels: Channels
     sample_period_s: float
-    unit_ids: tuple[str, ...]
+    unit_ids: Names
     A: Array  # (unit, n, n)
     B: Array  # (unit, n, m)
     parameters: Mapping[str, Array]  # of the lifting, (unit,)
@@ -48,7 +48,7 @@ class ModelSet(Shown, Storable):
     input_scale: Array  # (m,)
     alpha: float | None = None  # Tikhonov coefficient, where there is one
     alpha_in_ranges: bool = False  # whether alpha is for channels divided by the ranges or for the recordings' units
-    status: tuple[str, ...] = field(default=())  # per unit ``ok``, or what is wrong
+    status: Names = field(default=())  # per unit ``ok``, or what is wrong
     longest_s: float | None = None  # longest episode, below whose inverse the models know no frequency, where known
 
     def save(self, folder: Path) -> None:
@@ -74,7 +74,7 @@ class ModelSet(Shown, Storable):
         outputs, inputs = ", ".join(self.lifting.names), ", ".join(self.inputs)
         return f"ModelSet({self.name!r}: {units}; lifted states {outputs}; inputs {inputs})"
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         functions = self.lifting.functions + self.lifting.input_functions
         rows = {"kind": self.name, "condition": self.condition, "units": len(self.unit_ids), "models": self.about}
         rows |= {"channels": ", ".join(c.label for c in self.channels), "functions": ", ".join(functions)}
@@ -86,12 +86,12 @@ class ModelSet(Shown, Storable):
         return f"order {self.lifting.n_lifted}, spectral radius at most {self.spectral_radius().max():.6g}"
 
     @property
-    def recorded_inputs(self) -> tuple[str, ...]:
+    def recorded_inputs(self) -> Names:
         """Names of the inputs that are recorded."""
         return tuple(c.name for c in self.channels if c.role is Role.INPUT)
 
     @property
-    def inputs(self) -> tuple[str, ...]:
+    def inputs(self) -> Names:
         """Names of the model's inputs, the columns of `B`: recorded inputs, then the lifting's input functions."""
         return self.recorded_inputs + self.lifting.input_functions
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from ..core import Array, ConfigError, did_you_mean
+from ..core import Array, ConfigError, Names, Record, did_you_mean
 from ..data import Population, split_episodes
 from ..lifting import Lifting
 from ..lifting.families import family
@@ -51,7 +50,7 @@ def lifting_settings(lifting: LiftingSettings | Mapping[str, object] | Sequence[
     return LiftingSettings.of(raw, "Lifting")
 
 
-def _sample(population: Population, test: Iterable[str] | None, names: tuple[str, ...]) -> Array:
+def _sample(population: Population, test: Iterable[str] | None, names: Names) -> Array:
     """Return values of formulas on training episodes, one of every unit and condition, thinned."""
     keys = [split.train[0] for split in split_episodes(population, test).values()]
     keys = keys[:: max(1, -(-len(keys) // _EPISODES))]
@@ -70,7 +69,7 @@ def resolve_phase(declared: CalibrationSettings, population: Population, lifting
     """Return what has to be calibrated: nothing, or the phase of a disturbance that is fixed to an angle."""
     if not lifting.parameters:
         return None
-    known: dict[str, Any] = declared.model_dump(exclude_none=True)
+    known: Record = declared.model_dump(exclude_none=True)
     if "ratio" not in known and "gear_ratio" not in population.metadata:
         known = _written_ratio(lifting, population.states, declared.angle) | known
     known["ratio"] = _ratio(known.get("ratio"), population)
@@ -82,7 +81,7 @@ def resolve_phase(declared: CalibrationSettings, population: Population, lifting
     return spec
 
 
-def _written_ratio(lifting: Lifting, angles: Sequence[str], angle: str | None) -> dict[str, Any]:
+def _written_ratio(lifting: Lifting, angles: Sequence[str], angle: str | None) -> Record:
     """Return angle and ratio where every function of the phase reads ``ratio*angle + phase``."""
     import sympy as sp
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from ..core import Settings
+from ..core import Names, Record, Settings
 from ..lifting.families import check_family
 
 
@@ -17,15 +17,15 @@ class LiftingSettings(Settings):
     inputs of the model.
     """
 
-    functions: tuple[str, ...] | None = Field(None, description="lifted functions of the states, as formulas")
-    families: tuple[dict[str, Any], ...] = Field(
+    functions: Names | None = Field(None, description="lifted functions of the states, as formulas")
+    families: tuple[Record, ...] = Field(
         (), description="tables with a kind each, whose formulas stand behind the functions"
     )
-    input_functions: tuple[str, ...] = Field((), description="further inputs of the model, of states and inputs")
+    input_functions: Names = Field((), description="further inputs of the model, of states and inputs")
 
     @field_validator("families")
     @classmethod
-    def _known(cls, value: tuple[dict[str, Any], ...]) -> tuple[dict[str, Any], ...]:
+    def _known(cls, value: tuple[Record, ...]) -> tuple[Record, ...]:
         for table in value:
             check_family(table)
         return value

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from ..core import ITERATED, Array, DataError, Work, grouped
+from ..core import ITERATED, Array, DataError, Names, Record, Work, grouped
 from ..core.artifacts import Storable, digest_of, divided, file_digest
 from ..core.files import is_file, link_or_copy, stamp_of
 from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, scaling_of, split_episodes
+from ..data.population import Keys
 from ..data.prepare import PreparedSource
 from ..data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..data.recording import check_population, refuse_copies, some, title, usable, usable_episodes
@@ -36,20 +37,20 @@ class RecordingFacts(Storable):
     KIND = "facts"
     identify_on: str  # condition whose models feed synthesis
     groups: dict[str, str]
-    train: tuple[EpisodeKey, ...]
-    test: tuple[EpisodeKey, ...]
+    train: Keys
+    test: Keys
     resolution: dict[str, float]  # quantisation step found in every measured channel
-    dropped: tuple[str, ...] = ()  # episodes that were left out, with the reason
-    alerts: tuple[str, ...] = ()  # what looks wrong in the recordings without making them unusable
-    reserve: tuple[str, ...] = ()
-    digests: tuple[str, ...] = ()  # of the samples of the training episodes, then of the test episodes
+    dropped: Names = ()  # episodes that were left out, with the reason
+    alerts: Names = ()  # what looks wrong in the recordings without making them unusable
+    reserve: Names = ()
+    digests: Names = ()  # of the samples of the training episodes, then of the test episodes
 
     @cached_property
-    def pooled(self) -> tuple[str, ...]:
+    def pooled(self) -> Names:
         """Units that take part in pooled results."""
         return tuple(u for u, group in self.groups.items() if group != OUTLIERS)
 
-    def keys(self, part: str, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
+    def keys(self, part: str, unit: str | None = None, condition: str | None = None) -> Keys:
         """Return the episodes of a part, ``train`` or ``test``, of a unit, a condition or both."""
         keys: Sequence[EpisodeKey] = getattr(self, part) if unit is None else self._by_unit.get((part, unit), ())
         return tuple(k for k in keys if condition in (None, k.condition))
@@ -60,7 +61,7 @@ class RecordingFacts(Storable):
         parts = {part: grouped(getattr(self, part), lambda key: key.unit) for part in _PARTS}
         return {(part, unit): keys for part, of in parts.items() for unit, keys in of.items()}
 
-    def marks(self, keys: Iterable[EpisodeKey]) -> tuple[str, ...]:
+    def marks(self, keys: Iterable[EpisodeKey]) -> Names:
         """Return the digests of some episodes."""
         return tuple(self._digests[key] for key in keys)
 
@@ -68,7 +69,7 @@ class RecordingFacts(Storable):
     def _digests(self) -> dict[EpisodeKey, str]:
         return dict(zip((*self.train, *self.test), self.digests, strict=False))
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> Record:
         """Return the facts in JSON's types."""
         return dict(divided(self)[0])
 

@@ -9,8 +9,9 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from ..core import Array, ConfigError, frozen
+from ..core import Array, ConfigError, Names, Record, frozen
 from ..data import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
+from ..data.population import Channels
 from ..data.prepare import assemble
 from ..data.recording import Recording, Recordings
 
@@ -94,7 +95,7 @@ class BatchSettings:
             drawn.insert(0, {n: v * np.exp(self.outlier_severity * factors.get(n, 0.0)) for n, v in bad.items()})
         return tuple(units), {n: np.array([d[n] for d in drawn]) for n in drawn[0]}
 
-    def draw(self, rng: np.random.Generator) -> dict[str, Any]:
+    def draw(self, rng: np.random.Generator) -> Record:
         """Draw the parameters of one unit."""
         kinds = self.parameters.items()
         return {n: v * float(np.exp(self.spread * dev * rng.standard_normal())) for n, (v, dev) in kinds}
@@ -104,7 +105,7 @@ class BatchSettings:
 class UnitTruth(ABC):
     """True parameters, each an array of shape (n_units,), and the differential equation that they belong to."""
 
-    unit_ids: tuple[str, ...]  # order of the unit axis
+    unit_ids: Names  # order of the unit axis
     plant: ClassVar[str]
     n_states: ClassVar[int]
     sample_period_s: ClassVar[float]
@@ -131,12 +132,12 @@ class UnitTruth(ABC):
                 x = self.held(x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
         return np.moveaxis(out, 0, -1).copy()
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Record:
         """Return all parameters, ready for JSON: one entry per unit."""
         return {"plant": self.plant, "units": by_unit(self.unit_ids, self)}
 
 
-def by_unit(units: Sequence[str], parameters: Any) -> dict[str, dict[str, Any]]:
+def by_unit(units: Sequence[str], parameters: Any) -> dict[str, Record]:
     """Return the fields of parameters, whose first axis is that of units, ready for JSON: one entry per unit."""
     names = [f.name for f in fields(parameters) if f.name != "unit_ids"]
     return {unit: {name: getattr(parameters, name)[i].tolist() for name in names} for i, unit in enumerate(units)}
@@ -149,8 +150,8 @@ class Batch(BatchSettings, ABC, Generic[P]):
     """A batch of small plants with one pseudorandom input; the first state is seen by an encoder."""
 
     truth: Callable[..., P]  # of the units: names, then arrays by name
-    channels: ClassVar[tuple[Channel, ...]]
-    truths: ClassVar[tuple[Channel, ...]] = ()
+    channels: ClassVar[Channels]
+    truths: ClassVar[Channels] = ()
     noise: ClassVar[tuple[float, ...]]  # standard deviations of the sensors behind the encoder
 
     @abstractmethod

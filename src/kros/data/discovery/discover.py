@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_mean, frozen
+from ...core.arrays import Texts
 from ..measures import split_header
 from ..population import EpisodeKey, Population, Role
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, part_of, read_csv_folder
@@ -45,7 +46,7 @@ class Discovery:
     prepare: tuple[Record, ...]  # steps of preparation that the recordings need
     columns: tuple[TableColumn, ...]  # all of them, with their parts
     population: Population  # as the mapping reads it, before preparation
-    notes: dict[str, str] = field(default_factory=dict)  # what a key of the mapping rests on
+    notes: Texts = field(default_factory=dict)  # what a key of the mapping rests on
     findings: Names = ()  # what looks wrong
     reading: str = ""  # what the first file was taken for
 
@@ -66,7 +67,7 @@ def discover(source: Path, wanted: Wanted | None = None, work: Work | None = Non
     columns = _decided(columns, wanted)
     recorded = (c for c in columns if c.part not in (ColumnPart.TIME, ColumnPart.LEFT_OUT))
     mapping |= {**keys, "channel": [_channel(c) for c in recorded]}
-    damaged = dict[str, str]()
+    damaged = Texts()
     population = read_csv_folder(source, mapping | _exclusion(list(strange)), damaged=damaged)
     alone = f"{len(strange)} files are not like the others and left alone: {some(list(strange))}"
     findings = [f"{alone}; the first {next(iter(strange.values()))}"] if strange else []
@@ -95,7 +96,7 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     return selected
 
 
-def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], dict[str, str]]:
+def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], Texts]:
     """Return how most files are written, those files, and what is different in the others."""
     paths, heads = list(files.values()), []
     for path in paths[:: max(1, len(paths) // RULE.looked_at)]:
@@ -107,7 +108,7 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], dict[st
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
     usual = (h for h in heads if (h.dialect, h.fields) == commonest)
     head = max(usual, key=lambda h: sum(map(h.is_numeric, range(len(h.fields)))))  # a sensor may have been off
-    alike, strange = dict[str, Table](), dict[str, str]()
+    alike, strange = dict[str, Table](), Texts()
     for relative, path in files.items():
         try:
             table = Table.open(path, head.dialect, head.fields)
@@ -124,12 +125,12 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], dict[st
 
 def _columns(
     source: Path, head: TableHead, tables: Sequence[Table], period_s: float | None
-) -> tuple[list[TableColumn], Record, dict[str, str]]:
+) -> tuple[list[TableColumn], Record, Texts]:
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
     columns = describe(head)
     numeric = [c for c in columns if head.is_numeric(c.at)]
     table, samples = _sampled(source, tables, numeric)
-    candidates, labels = time_columns(numeric, samples), dict[str, str]()
+    candidates, labels = time_columns(numeric, samples), Texts()
     if period_s is None and not candidates:
         labels = label_columns(table)  # of several episodes in a file
     if labels:
@@ -137,7 +138,7 @@ def _columns(
         episodes = [rows for _, rows in stretches(texts)][: RULE.sampled]
         samples = {at: [signals[0][rows] for rows in episodes] for at, signals in samples.items()}
         candidates = time_columns(numeric, samples)
-    known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), dict[str, str]()
+    known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), Texts()
     if period_s is None:
         time, keys, notes = _time(source, head, columns, candidates, samples)
         known[time.at] = replace(time, part=ColumnPart.TIME)
@@ -172,7 +173,7 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColum
 
 def _time(
     source: Path, head: TableHead, columns: Sequence[TableColumn], candidates: Sequence[TableColumn], samples: Samples
-) -> tuple[TableColumn, Record, dict[str, str]]:
+) -> tuple[TableColumn, Record, Texts]:
     """Return the column of time, the keys of a mapping that describe it, and what they rest on."""
     stamps = {c: head.timestamp(c.at) for c in columns}
     texts = [c for c, order in stamps.items() if order is not None]

@@ -12,7 +12,6 @@ from ..population import EpisodeKey, Population
 from ..recording import (
     CHECK,
     GroupWatch,
-    NonFiniteError,
     check_episode,
     check_increasing,
     copies_among,
@@ -88,20 +87,19 @@ def _look(population: Population) -> list[EpisodeLook]:
                 deviation = np.abs(np.diff(time) / period - 1)
             usable_s = np.asarray(recording.usable(period).time_s)
             start, stop = longest_stretch(usable_s, GAP * period)
-            look = EpisodeLook(
+            whole = usable(values).all(axis=1)
+            check_episode(values, key, population.columns, gaps=bool(whole.any()))
+            looks[key] = EpisodeLook(
                 key,
-                "",
-                stop - start,
-                len(usable_s) - (stop - start),
-                period,
-                (float(deviation.max()), int(deviation.argmax())),
+                n_samples=stop - start,
+                lost=len(usable_s) - (stop - start),
+                period_s=period,
+                uneven=(float(deviation.max()), int(deviation.argmax())),
+                nan=not whole.all(),
+                digest=digest_of(values),
             )
-            check_episode(values, key, population.columns)
-            looks[key] = replace(look, digest=digest_of(values))
-            watch.add(key, values)
-        except NonFiniteError as error:
-            whole = usable(values).all(axis=1).any()
-            looks[key] = replace(look, nan=True) if whole else EpisodeLook(key, str(error))
+            if whole.all():
+                watch.add(key, values)
         except DataError as error:
             looks[key] = EpisodeLook(key, str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())

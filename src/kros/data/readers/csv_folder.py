@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from ...core import ByName, Columns, DataError, Names, Record, Settings, did_you_mean, frozen, read_toml
+from ...core.arrays import Texts
 from ..measures import clean_unit, measure, split_header
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble
@@ -222,12 +223,12 @@ def read_csv_folder(
     source: Path | str,
     mapping: CsvMapping | ByName | Path | str,
     optional: Collection[str] = (),
-    damaged: dict[str, str] | None = None,
+    damaged: Texts | None = None,
 ) -> Population:
     """Read a folder of CSV files; those that cannot be used are collected in `damaged`, with the reason, or refused."""
     chosen, source = load_mapping(mapping), Path(source)
     dialect, places = chosen.dialect, dict[EpisodeKey, FilePlace]()
-    groups, units_of_measure = dict[str, str](), dict[Column, str]()
+    groups, units_of_measure = Texts(), dict[Column, str]()
     for path, match in _matches(source, chosen):
         named = {name: text for name, text in match.groupdict().items() if text}
         try:
@@ -264,7 +265,7 @@ def part_of(path: str, key: EpisodeKey) -> str:
 
 
 def _episodes(
-    table: Table, named: dict[str, str], mapping: CsvMapping, known: dict[Column, str]
+    table: Table, named: Texts, mapping: CsvMapping, known: dict[Column, str]
 ) -> Iterator[tuple[EpisodeKey, FilePlace]]:
     """Yield the episodes of a file, of which its name says some parts; `known` are units of measure of other files."""
     places = [(unit.suffix, _places(table, mapping, unit, known)) for unit in mapping.units]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...core import Array, ByName, DataError, MissingDependencyError, Record, limits
+from ...core.arrays import Texts
 from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of
 from ..recording import some
 
@@ -35,7 +36,7 @@ def _hdf5(path: Path) -> Iterator[Group]:
     """HDF5; a unit of measure is the attribute `units` or `unit` of a data set."""
     import h5py
 
-    content, units = Record(), dict[str, str]()
+    content, units = Record(), Texts()
 
     def visit(place: str, item: Any) -> None:
         name, unit = place.replace("/", "."), item.attrs.get("units", item.attrs.get("unit", ""))
@@ -119,7 +120,7 @@ def is_binary(path: Path) -> bool:
     return path.suffix.lower() in FORMATS
 
 
-def columns_of(path: Path, wanted: Collection[str | int | None] = ()) -> dict[str, str]:
+def columns_of(path: Path, wanted: Collection[str | int | None] = ()) -> Texts:
     """Return the columns of the table of a file that `wanted` names, with their units of measure."""
     tables = _heads(path, stamp_of(path))
     return tables[_chosen(path, tables, wanted)]
@@ -158,7 +159,7 @@ def _chosen(path: Path, tables: Sequence[Mapping[str, str]], wanted: Collection[
 
 
 @cache
-def _heads(path: Path, version: tuple[int, int]) -> list[dict[str, str]]:
+def _heads(path: Path, version: tuple[int, int]) -> list[Texts]:
     """Return the columns of all tables of a file with their units, kept since reading some formats takes long."""
     return [{name: unit for name, (_, unit) in table.items()} for table in _tables(path, version)]
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from ...core import AnyArray, Array, ConfigError, DataError, Flags, frozen, member
+from ...core import AnyArray, Array, ConfigError, DataError, Flags, Names, Record, frozen, member
 from ...data import Channel, EpisodeKey, Role, prepare
 from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
@@ -130,7 +130,7 @@ MAX_OFFSET_RAD = 0.02  # of the measured position, at the gearbox output
 class Truth:
     """True parameters and signals of a simulated population."""
 
-    unit_ids: tuple[str, ...]  # order of the unit axis
+    unit_ids: Names  # order of the unit axis
     parameters: DriveParameters
     loop: Loop
     gains: Gains
@@ -148,7 +148,7 @@ class Truth:
             raise DataError(f"Load torque of {key}: only the {len(self.load_rows)} loaded episodes have one.")
         return self.load_signals[self.load_rows[key]]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Record:
         """Return everything but the long signals, ready for JSON: one entry per unit."""
         units = by_unit(self.unit_ids, self.parameters)
         return {"plant": "harmonic-drive", "loop": self.loop.value, "gains": asdict(self.gains), "units": units}
@@ -169,7 +169,7 @@ class HarmonicDrivePopulation(BatchSettings):
 
     n_units: int = 12
     loop: Loop | str = Loop.STIFF  # stiff or soft velocity loop
-    conditions: tuple[str, ...] = CONDITIONS  # among "noload" and "load"
+    conditions: Names = CONDITIONS  # among "noload" and "load"
 
     plant: ClassVar[str] = "harmonic-drive"
     least_seconds: ClassVar[float] = 2.0
@@ -212,7 +212,7 @@ class HarmonicDrivePopulation(BatchSettings):
         truth = Truth(names, parameters, loop, GAINS[loop], load_rows, signals)
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
-    def draw(self, rng: np.random.Generator) -> dict[str, Any]:
+    def draw(self, rng: np.random.Generator) -> Record:
         """Draw the parameters of one drive, those of its ripple last."""
         ripple = super().draw(rng) | {
             "ripple": RIPPLE * np.exp(self.spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))

@@ -40,11 +40,11 @@ def test_values_beyond_those_of_all_other_units_are_named() -> None:
     """A temperature of five units, of one in degrees Fahrenheit; five units at temperatures of their own are as many."""
     low, high = np.array([20.0, 22.0, 21.0, 23.0, 20.5]), np.array([60.0, 55.0, 58.0, 61.0, 59.0])
     low[3], high[3] = 1.8 * low[3] + 32, 1.8 * high[3] + 32
-    ends = np.stack([low, high], axis=-1)[:, :, None]
+    ends = np.stack([0 * low, 0 * low, low, high], axis=-1)[:, None, :, None]
     (text,) = apart(["temperature"], dict(zip("abcde", ends, strict=True)))
     values = "values between 73.4 and 141.8, those of other units between 20 and 60"
     assert text == f"Unit d: temperature has {values}; check its column and unit of measure."
-    stairs = ends[:1] + 100 * np.arange(5)[:, None, None]
+    stairs = ends[:1] + 100 * np.arange(5)[:, None, None, None]
     assert apart(["temperature"], dict(zip("abcde", stairs, strict=True))) == []
 
 

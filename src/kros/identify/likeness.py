@@ -51,17 +51,19 @@ def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> lis
 def apart(channels: Sequence[str], units: Mapping[str, Array]) -> list[str]:
     """Return a sentence for every channel of a unit whose values are beyond those of all others, which are alike.
 
-    Units have the ends of their values, (2, c).
+    Units have the courses of their episodes, (episode, 4, c).
     """
-    ends, found = np.array(list(units.values())), list[str]()
-    low, high = np.median(ends, axis=0)
-    among = (ends[:, 0] <= high) & (ends[:, 1] >= low)  # what most units have
-    for i, k in np.argwhere(~among & (2 * among.sum(axis=0) > len(ends)) & (high > low)):
-        (least, most), (lowest, highest) = ends[i, :, k], np.delete(ends, i, axis=0)[:, :, k].T
-        if least > highest.max() or most < lowest.min():
-            others = f"those of other units between {lowest.min():.4g} and {highest.max():.4g}"
-            text = f"values between {least:.4g} and {most:.4g}, {others}; check its column and unit of measure."
-            found.append(f"Unit {list(units)[i]}: {channels[k]} has {text}")
+    lows, highs = (
+        np.array([end(of[:, row], axis=0) for of in units.values()]) for end, row in ((np.min, 2), (np.max, 3))
+    )
+    low, high, found = np.median(lows, axis=0), np.median(highs, axis=0), list[str]()
+    among = (lows <= high) & (highs >= low)  # what most units have
+    for i, k in np.argwhere(~among & (2 * among.sum(axis=0) > len(lows)) & (high > low)):
+        lowest, highest = np.delete(lows[:, k], i).min(), np.delete(highs[:, k], i).max()
+        if lows[i, k] > highest or highs[i, k] < lowest:
+            others = f"those of other units between {lowest:.4g} and {highest:.4g}"
+            text = f"values between {lows[i, k]:.4g} and {highs[i, k]:.4g}, {others}"
+            found.append(f"Unit {list(units)[i]}: {channels[k]} has {text}; check its column and unit of measure.")
     return found
 
 

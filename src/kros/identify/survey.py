@@ -74,13 +74,7 @@ class RecordingFacts(Storable):
         return dict(divided(self)[0])
 
 
-@dataclass(frozen=True)
-class _Group:
-    """One unit in one condition, for a worker; `folder` is None where the recordings stay where they are."""
-
-    population: Population
-    folder: Path | None
-    on_nan: str
+_Task = tuple[Population, Path | None, str]  # a unit in a condition, where it is written, if anywhere, and on_nan
 
 
 @dataclass(frozen=True)
@@ -139,14 +133,12 @@ def survey(
     folder = None if copy is None else copy.folder
     if folder is not None:
         folder.mkdir(parents=True)
-    tasks = [_Group(population.select([u], [c]), folder, chosen.on_nan) for u, c, _ in population.groups()]
-    keys = (keys for _, _, keys in population.groups())
-    marks = _marks(population.source, keys, chosen.on_nan, folder is None)
-    groups = list(
-        (work or Work()).recall(
-            "read", _read_group, tasks, marks, _GroupFacts, lambda _, known: copy is None or copy.reuse(known)
-        )
+    tasks: list[_Task] = [(population.select([u], [c]), folder, chosen.on_nan) for u, c, _ in population.groups()]
+    marks = _marks(population.source, (part.episodes for part, *_ in tasks), chosen.on_nan, folder is None)
+    recalled = (work or Work()).recall(
+        "read", _read_group, tasks, marks, _GroupFacts, lambda _, known: copy is None or copy.reuse(known)
     )
+    groups = list(recalled)
     if folder is None:
         digests = {e.key: e.digest for group in groups for e in group.episodes}
         refuse_copies(digests.items())
@@ -212,10 +204,7 @@ def _unlike(population: Population, read: Sequence[_GroupFacts], units: Collecti
     for of in by_condition.values():
         if len(of) > 2:
             texts += unlike(names, {u: {title(e.key): e.moments for e in episodes} for u, episodes in of.items()})
-            ends = {u: np.array([e.course[2:] for e in episodes]) for u, episodes in of.items()}
-            named = tuple(f"{text.partition(' moves ')[0]} " for text in texts)
-            ends = {u: np.array([v[:, 0].min(axis=0), v[:, 1].max(axis=0)]) for u, v in ends.items()}
-            texts += [text for text in apart(names, ends) if not text.startswith(named)]
+            texts += apart(names, {u: np.array([e.course for e in episodes]) for u, episodes in of.items()})
     return list(dict.fromkeys(texts))
 
 
@@ -242,24 +231,24 @@ def condition_of(population: Population, wanted: str | None) -> str:
     return wanted
 
 
-def _read_group(task: _Group) -> _GroupFacts:
+def _read_group(task: _Task) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
-    population, record, written = task.population, None, None
+    (population, folder, on_nan), record, written = task, None, None
     names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
 
     def episodes_in_turn() -> Iterator[tuple[EpisodeKey, Array, str]]:
-        for key, values, digest in usable_episodes(population, task.on_nan):
+        for key, values, digest in usable_episodes(population, on_nan):
             if not episodes:
                 resolution.update(_resolution(population, key, values))
             recorded = values[:, : len(names)]
             episodes.append(_EpisodeFacts(key, digest, len(values), course(recorded), moments(recorded)))
             yield key, values, digest
 
-    if task.folder is None:
+    if folder is None:
         deque(episodes_in_turn(), maxlen=0)
     else:
-        record = write_group(population, task.folder, episodes_in_turn())
-        written = file_digest(task.folder / record.file)
+        record = write_group(population, folder, episodes_in_turn())
+        written = file_digest(folder / record.file)
     return _GroupFacts(record, written, resolution, episodes)
 
 

@@ -11,19 +11,12 @@ import numpy as np
 from ...core import Array, frozen
 from ..measures import ZERO_OF_CELSIUS, Measure, clean_unit, identifier, kind_of, measure, split_header, words_of
 from ..readers.parquet import KEYS
-from ..readers.tables import Table, stretches
+from ..readers.tables import Table
 
 UNKNOWN = "not recognised"
 Samples = Mapping[int, Sequence[Array]]  # of columns by their place, from several episodes
 _STATES = ["angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration"]
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
-
-LABELS = {
-    "unit": "unit serial number sn id name device machine motor drive rig sample specimen cell dut uut asset maschine "
-    "geraet seriennummer nr no",
-    "condition": "condition mode zustand",
-    "episode": "episode run trial test experiment cycle repetition measurement versuch messung lauf",
-}
 
 
 class ColumnPart(str, Enum):
@@ -140,15 +133,3 @@ def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
     if column.kind in _STATES:
         return ColumnPart.STATE, f"{column.kind}, by name or unit"
     return ColumnPart.LEFT_OUT, UNKNOWN
-
-
-def label_columns(table: Table) -> dict[str, str]:
-    """Return the columns whose names and values, which change now and then in a file, say that they label rows."""
-    labels = dict[str, str]()
-    for field in table.fields:
-        words = set(identifier(f"{field} ").lower().split("_"))
-        role = next((role for role, known in LABELS.items() if words <= set(known.split())), None)
-        rows = [rows for _, rows in stretches([table.texts(table.fields.index(field))])] if role else []
-        if role and 1 < len(rows) < rows[-1].stop / 10:
-            labels.setdefault(role, field)
-    return labels

@@ -151,7 +151,7 @@ class Drives:
         found = np.zeros(batch.states.shape[:2])
         for i, key in enumerate(batch.keys):
             if key.condition == "load":
-                found[:, i] = self.truth.load_torque(key)
+                found[:, i] = self.truth.load_torque[key]
         return found
 
     def parameters(self, kind: str, batch: EpisodeBatch) -> dict[str, Array] | None:

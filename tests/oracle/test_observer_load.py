@@ -89,7 +89,7 @@ def drives() -> SimpleNamespace:
     def read(keys: list) -> SimpleNamespace:
         values = np.stack([population.read(k) for k in keys], axis=1)
         load = np.stack(
-            [truth.load_torque(k) if k.condition == "load" else np.zeros(len(values)) for k in keys], axis=1
+            [truth.load_torque[k] if k.condition == "load" else np.zeros(len(values)) for k in keys], axis=1
         )
         phase = np.array([phases[k.unit] for k in keys])
         x, u = values[..., :3], values[..., 3:]

@@ -173,9 +173,9 @@ def test_at_rest_the_load_torque_is_gravity_and_the_current_holds_it(drives):
         for key in drives.population.keys(unit, "load"):
             start = drives.population.read(key)[0]
             gravity = truth.parameters.load_moment[row] * np.sin(start[3]) / truth.parameters.torque_constant[row]
-            assert truth.load_torque(key)[0] == pytest.approx(
+            assert truth.load_torque[key][0] == pytest.approx(
                 gravity, abs=2e-3
             )  # the twist turns the load by less than 5 mrad
             held = drives.raw.read(key)[:1000, 2].mean()
             physics = Physics(truth.parameters.take([row]), np.ones(1), start[3:4])
-            assert held == pytest.approx(truth.load_torque(key)[0] + physics.disturbance(start[3:4])[0], abs=2e-3)
+            assert held == pytest.approx(truth.load_torque[key][0] + physics.disturbance(start[3:4])[0], abs=2e-3)

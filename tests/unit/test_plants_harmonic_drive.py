@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from kros.core.errors import ConfigError, DataError
+from kros.core.errors import ConfigError
 from kros.data import EpisodeKey
 from kros.plants import HarmonicDrivePopulation
 from kros.plants.harmonic_drive.dynamics import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, DriveParameters
@@ -52,9 +52,8 @@ def test_outlier_is_loose_by_its_severity():
 
 
 def test_load_torque_belongs_to_loaded_episodes(small):
-    assert small.truth.load_torque(LOADED).shape == (3000,)
-    with pytest.raises(DataError, match="noload"):
-        small.truth.load_torque(replace(LOADED, condition="noload"))
+    assert small.truth.load_torque[LOADED].shape == (3000,)
+    assert replace(LOADED, condition="noload") not in small.truth.load_torque
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ...core import AnyArray, Array, ConfigError, DataError, Flags, Names, Record, frozen, member
+from ...core import AnyArray, Array, ConfigError, Flags, Names, Record, frozen, member
 from ...data import Channel, EpisodeKey, Role, prepare
 from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
@@ -134,19 +134,12 @@ class Truth:
     parameters: DriveParameters
     loop: Loop
     gains: Gains
-    load_rows: Mapping[EpisodeKey, int]  # row of `load_signals` of each loaded episode
-    load_signals: AnyArray  # shape (n_loaded, n_samples), float32, in step with the prepared episodes
+    load_torque: Mapping[EpisodeKey, AnyArray]  # that the load takes from the flange, inertia and gravity, (n_samples,)
 
     @property
     def phase_rad(self) -> AnyArray:
         """Phase `phi1` of (34), shape (n_units,), rad, in [0, 2 pi)."""
         return self.parameters.phase_rad[:, 0]
-
-    def load_torque(self, key: EpisodeKey) -> AnyArray:
-        """Return the torque that the load takes from the flange in an episode, inertia and gravity, (n_samples,)."""
-        if key not in self.load_rows:
-            raise DataError(f"Load torque of {key}: only the {len(self.load_rows)} loaded episodes have one.")
-        return self.load_signals[self.load_rows[key]]
 
     def as_dict(self) -> Record:
         """Return everything but the long signals, ready for JSON: one entry per unit."""
@@ -207,9 +200,8 @@ class HarmonicDrivePopulation(BatchSettings):
             parts[key] = states[i], inputs[episode[i]], true[i]
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
-        load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
-        names, signals = tuple(u.id for u in units), torque[:, REST_SAMPLES:-1]
-        truth = Truth(names, parameters, loop, GAINS[loop], load_rows, signals)
+        load_torque = dict(zip((k for k in keys if k.condition == "load"), torque[:, REST_SAMPLES:-1], strict=True))
+        truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_torque)
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
     def draw(self, rng: np.random.Generator) -> Record:

@@ -59,9 +59,9 @@ def test_a_stuck_sensor_is_named(column: int, level: float) -> None:
 
 def test_short_and_misshapen() -> None:
     check_episode(values(n=3), KEY, CHANNELS)
-    with pytest.raises(DataError, match="at least 3 samples are needed, found 2"):
+    with pytest.raises(DataError, match="needs at least 3 samples, found 2"):
         check_episode(values(n=2), KEY, CHANNELS)
-    with pytest.raises(DataError, match=r"3 channels .* shape \(20, 2\)"):
+    with pytest.raises(DataError, match=r"3 channels, .* shape \(20, 2\)"):
         check_episode(values()[:, :2], KEY, CHANNELS)
 
 

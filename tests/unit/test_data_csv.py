@@ -179,7 +179,7 @@ def test_another_rate(folder: Path) -> None:
         ({"skip_rows": -1}, "skip_rows: input should be greater than or equal to 0, found -1"),
         (
             {"unit": [{"suffix": "1", "columns": {"z": "pos"}}]},
-            r"gives a column for 'z'; the channels are \['u', 'x'\]",
+            r"gives a column for 'z'; channels are \['u', 'x'\]",
         ),
     ],
 )

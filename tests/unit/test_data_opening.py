@@ -68,7 +68,7 @@ def test_missing_empty_and_useless_folders(folders: Path, reader: str | None) ->
 def test_unknown_reader_and_options(folders: Path) -> None:
     with pytest.raises(ConfigError, match="one of motor-drive-raw, parquet, csv, found 'hdf5'"):
         read(folders / "csv", "hdf5")
-    with pytest.raises(ConfigError, match="needs a mapping of columns"):
+    with pytest.raises(ConfigError, match="needs a mapping"):
         read(folders / "csv", "csv")
     with pytest.raises(ConfigError, match="a CSV mapping is given"):
         read(folders / "parquet", "parquet", mapping=MAPPING)

@@ -132,7 +132,7 @@ def test_existing_folders_are_kept(tmp_path: Path) -> None:
 
 def test_channel_named_like_a_key_column(tmp_path: Path) -> None:
     channels = (Channel("k", Role.STATE), *CHANNELS[1:])
-    with pytest.raises(DataError, match=r"channels \['k'\] have the name of a key column"):
+    with pytest.raises(DataError, match=r"channels \['k'\] have names of the columns of keys"):
         write_parquet(from_arrays({"a": [values(0)]}, channels, 0.01), tmp_path / "out")
 
 

@@ -114,8 +114,7 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
         return arrays
     except _DAMAGED as error:
         pass_on_shortage(error, path)
-        problem = f"not a valid archive of arrays ({error or type(error).__name__})"
-        raise DataError(f"Reading {path}: {problem}; {_AGAIN}.") from error
+        raise DataError(f"Reading {path}: not a valid archive ({error or type(error).__name__}); {_AGAIN}.") from error
 
 
 def save_artifact(folder: Path, kind: str, content: ByName, arrays: Mapping[str, np.ndarray] | None = None) -> None:

@@ -46,8 +46,7 @@ def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) 
         found = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device"
         raise error(f"Reading {path}: a regular file is needed, found {found}; name a file.")
     if status.st_size > limit:
-        advice = "split it, or raise the limit in kros.core.limits"
-        raise error(f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; {advice}.")
+        raise error(f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; split it.")
 
 
 def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> bytes:

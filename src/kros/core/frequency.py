@@ -11,8 +11,7 @@ from .errors import ConfigError
 def nyquist_hz(sample_period_s: float) -> float:
     """Return half the sampling frequency, Hz."""
     if not sample_period_s > 0:
-        problem = f"the sampling period should be positive, found {sample_period_s} s"
-        raise ConfigError(f"Nyquist frequency: {problem}; only discrete systems have one.")
+        raise ConfigError(f"Nyquist frequency: needs a positive sampling period, found {sample_period_s} s.")
     return 0.5 / sample_period_s
 
 

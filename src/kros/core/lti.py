@@ -26,15 +26,13 @@ def real_array(name: str, values: Any) -> AnyArray:
             raise ValueError("complex numbers; take the real part if that is meant")
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
-        problem = f"found {type(values).__name__}: {error}"
-        raise DimensionError(f"{name} should be a matrix of real numbers, {problem}.") from error
+        raise DimensionError(f"{name} should be a real matrix, found {type(values).__name__}: {error}.") from error
 
 
 def sampling_period(name: str, dt: Any) -> float:
     """Return the sampling period in seconds, or say by name what else was found."""
     if not isinstance(dt, int | float | np.number) or not 0 <= dt < np.inf:
-        wanted = "should be a number of seconds, not negative, 0 for continuous time"
-        raise DimensionError(f"{name}: the sampling period {wanted}; found {dt!r}.")
+        raise DimensionError(f"{name}: the sampling period should be seconds, 0 for continuous time; found {dt!r}.")
     return float(dt)
 
 
@@ -77,8 +75,7 @@ class StateSpace:
         shapes = {name: getattr(self, name).shape for name in "ABCD"}
         for name, shape in {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}.items():
             if shapes[name][-2:] != shape:
-                problem = f"{name} should end in shape {shape}, found {shapes}"
-                raise DimensionError(f"State space: {problem}; transpose or pad the offending matrix.")
+                raise DimensionError(f"State space: {name} should end in shape {shape}, found {shapes}; correct it.")
 
     @classmethod
     def of(cls, system: Any) -> StateSpace:

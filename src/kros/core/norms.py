@@ -39,8 +39,7 @@ def as_state_space(system: Any) -> StateSpace:
     """Return one system as `StateSpace`; anything with `A, B, C, D, dt` will do."""
     system = StateSpace.of(system)
     if system.batch_shape:
-        problem = f"needs one system, found a batch of shape {system.batch_shape}"
-        raise DimensionError(f"System norm: {problem}; index it, for example system[0].")
+        raise DimensionError(f"System norm: needs one system, found a batch of shape {system.batch_shape}; index it.")
     if not system.is_finite():
         raise KrosError("System norm: the matrices contain NaN or infinity; look at the step that built them.")
     return system
@@ -161,8 +160,7 @@ def hinf_norm(system: Any, tol: float = AGREED) -> float:
         before, (at, lower) = lower, max((peak, best), (at, lower), key=itemgetter(1))
         if best <= before * (1 + room):
             return precise_gain(system, _in_hz(system, at)) if refined else lower
-    problem = f"no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}"
-    raise KrosError(f"H-infinity norm: {problem}; scale states and time, or ask for a larger tol than {tol}.")
+    raise KrosError(f"H-infinity norm: no convergence in {_MAX_ITERATIONS} level sets from {lower}; scale states.")
 
 
 def to_continuous(system: StateSpace) -> StateSpace:
@@ -246,8 +244,7 @@ def precise_h2_norm(system: StateSpace) -> float:
     import mpmath
 
     if system.n_states > _MOST_STATES:
-        problem = f"double precision does not suffice, and multiple precision takes at most {_MOST_STATES} states"
-        raise SynthesisError(f"H2 norm: {problem}, found {system.n_states}; reduce the system, or scale its states.")
+        raise SynthesisError(f"H2 norm: {system.n_states} states are too many for more than double precision.")
     before = np.nan
     for digits in _DIGITS:
         with mpmath.workdps(digits):
@@ -255,8 +252,7 @@ def precise_h2_norm(system: StateSpace) -> float:
         if norm == before or abs(norm - before) <= ITERATED * abs(norm):
             return norm
         before = norm
-    problem = f"no two results agree with up to {_DIGITS[-1]} digits"
-    raise SynthesisError(f"H2 norm: {problem}; the system has poles on the stability limit.")
+    raise SynthesisError(f"H2 norm: {_DIGITS[-1]} digits do not suffice; the system has poles on the stability limit.")
 
 
 def _norm_of(mp: Any, system: StateSpace) -> float:

@@ -324,8 +324,7 @@ def split_episodes(population: Population, test: Iterable[str] | None = None) ->
         where = f"Splitting the episodes of unit {unit} ({condition})"
         ordered = sorted(keys, key=lambda k: natural_key(k.episode))
         if len(ordered) < 2:
-            needs = f"needs at least two, found {len(ordered)}"
-            raise DataError(f"{where} into training and test {needs}; record more, or leave the unit out.")
+            raise DataError(f"{where} into training and test needs at least two, found {len(ordered)}; record more.")
         names = {k.episode for k in ordered[-max(1, len(ordered) // 10) :]} if named is None else named
         train, tested = (tuple(k for k in ordered if (k.episode in names) is part) for part in (False, True))
         if not train or not tested:

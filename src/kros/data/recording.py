@@ -86,8 +86,7 @@ class Recordings:
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode."""
         if key not in self.places:
-            others = f"this source has {len(self.places)} other episodes"
-            raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
+            raise DataError(f"Asked for {key}; it is not in this source; take keys from population.episodes.")
         return self.read(key).distinct()
 
     def read(self, key: EpisodeKey) -> Recording:
@@ -122,12 +121,10 @@ def estimate_period(recording: Recording) -> float:
     """Return the median time step, rounded to six digits so that 0.0010000000000000009 s reads 0.001 s."""
     name, time = title(recording.key), np.zeros(0) if recording.time_s is None else recording.time_s
     if len(time) < 2:
-        need = "the sampling period needs at least two samples with time"
-        raise DataError(f"{name}: {need}, found {len(time)}; leave the episode out.")
+        raise DataError(f"{name}: a sampling period needs at least two samples with time, found {len(time)}.")
     period = float(f"{np.median(np.diff(time)):.6g}")
     if not period > 0:
-        advice = "name the column that holds time, in seconds and increasing"
-        raise DataError(f"{name}: the median time step is {period:g} s; {advice}.")
+        raise DataError(f"{name}: the median time step is {period:g} s; name the column of time, in seconds.")
     return period
 
 
@@ -182,11 +179,9 @@ class NonFiniteError(DataError):
 def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], gaps: bool = False) -> None:
     """Check one episode's samples: shape, length, numbers, and that no state stands still while others move."""
     if values.ndim != 2 or values.shape[1] != len(channels):
-        declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
-        raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
+        raise DataError(f"{title(key)}: needs {len(channels)} channels, found an array of shape {values.shape}.")
     if len(values) < CHECK.samples:
-        need = f"at least {CHECK.samples} samples are needed, found {len(values)}"
-        raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
+        raise DataError(f"{title(key)}: needs at least {CHECK.samples} samples, found {len(values)}; leave it out.")
     if not gaps and not usable(values).all():
         check_finite(values, key, channels, first=0)
     resting = [is_constant(signal) for signal in values.T]
@@ -299,8 +294,7 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
     truths = {c.name: c.of for c in channels if c.of or c.role is Role.TRUTH}
     owners, declared = set(truths.values()), {c.name for c in channels if c.role is Role.TRUTH}
     if set(truths) != declared or len(owners) < len(truths) or not owners <= set(states):
-        wanted = f"says with `of` which state it is the truth of, each of another one of {states}"
-        raise DataError(f"A channel with role 'truth' {wanted}, found {truths}; correct them.")
+        raise DataError(f"A truth says with `of` which state it is the truth of, one of {states}, found {truths}.")
     if not episodes:
         raise DataError("The population is empty: no episode was found; check the source and the reader.")
     ((key, count),) = Counter(episodes).most_common(1)
@@ -312,12 +306,10 @@ def check_population(population: Population, allow_single: bool = False) -> None
     """Check what needs no reading: not empty, no duplicates, a state, a measured state, more than one unit."""
     check_structure(population.columns, population.episodes)
     if not population.measured:
-        problem = f"No state of {list(population.states)} is measured, so an observer has nothing to correct with"
-        raise DataError(f"{problem}; declare measured = true for at least one.")
+        raise DataError(f"No state of {list(population.states)} is measured; declare measured = true for at least one.")
     if not population.inputs:
         roles = [(c.name, c.role.value) for c in population.columns]
-        reason = "models need what drives a machine"
-        raise DataError(f"No channel has the role 'input', found {roles}: {reason}; declare it.")
+        raise DataError(f"No channel has the role 'input', found {roles}; declare what drives a machine.")
     recorded = {key.unit for key in population.episodes}
     units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
     if len(units) < 2 and not allow_single:
@@ -343,8 +335,7 @@ def usable_episodes(population: Population, on_nan: str = "error") -> Iterator[t
     for problem in watch.problems():
         raise DataError(problem)
     if not usable:
-        group = f"Unit {key.unit} ({key.condition})"
-        raise DataError(f"{group}: every episode was dropped; fix the source or leave the unit out.")
+        raise DataError(f"Unit {key.unit} ({key.condition}): every episode was dropped; leave the unit out.")
 
 
 def digest_of(values: Array) -> str:
@@ -366,5 +357,4 @@ def copies_among(digests: Iterable[tuple[EpisodeKey, str]]) -> Iterator[tuple[Ep
 def refuse_copies(digests: Iterable[tuple[EpisodeKey, str]]) -> None:
     """Refuse copies, which put test episodes into training and one machine's data into another."""
     for key, other in copies_among(digests):
-        reason = "a copy leaks test episodes into training and makes units look alike"
-        raise DataError(f"{title(key)} is a copy of {other}, sample by sample; {reason}, so remove one of them.")
+        raise DataError(f"{title(key)} is a copy of {other}, so that test data leak into training; remove one of them.")

@@ -162,8 +162,7 @@ class Shift(Step):
         """Return the aligned recording, `abs(lag)` samples shorter."""
         n, length = len(recording.values), len(recording.values) - abs(self.lag)
         if length <= 0:
-            left = f"shifting by {self.lag} samples leaves nothing of {n}"
-            raise DataError(f"{title(recording.key)}: {left}; leave it out.")
+            raise DataError(f"{title(recording.key)}: a shift by {self.lag} leaves nothing of {n} samples.")
         fixed, moved = max(0, -self.lag), max(0, self.lag)
         columns, rest = self.columns(self.channels, channels), recording.cut(fixed, fixed + length)
         values = rest.values.copy()
@@ -269,8 +268,7 @@ class Resample(Step):
         median = estimate_period(timed)
         count = (time[-1] - time[0]) / min(self.period_s, median)
         if count > limits.MAX_SAMPLES:
-            make = f"would make {count:g} samples of {len(time)}"
-            raise DataError(f"{what} to period_s = {self.period_s:g} {make}; correct the period.")
+            raise DataError(f"{what} to {self.period_s:g} s would make {count:g} samples; correct the period.")
         return replace(recording, values=self.on_grid(time, timed.values, median), time_s=None)
 
     def on_grid(self, time_s: Array, values: Array, median_s: float) -> Array:

@@ -175,8 +175,7 @@ def _facts(
     splits, groups = split_episodes(retained.select(part), options.test), {u: retained.unit(u).group for u in part}
     episodes = [e for group in read for e in group.episodes if e.key.unit in groups]
     if short := [f"{title(e.key)} has {e.n_samples}" for e in episodes if e.n_samples < options.fewest]:
-        needs = f"every episode needs at least {options.fewest} samples after preparation"
-        raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
+        raise DataError(f"Every episode needs at least {options.fewest} samples after preparation; {some(short)}.")
     train, test = (tuple(k for s in splits.values() for k in getattr(s, name)) for name in _PARTS)
     digests, measured = {e.key: e.digest for e in episodes}, retained.measured
     of_states = np.array([e.course for e in episodes])[..., : len(retained.states)]
@@ -226,8 +225,7 @@ def condition_of(population: Population, wanted: str | None) -> str:
     if wanted is None:
         return UNLOADED if UNLOADED in conditions else next(iter(conditions), DEFAULT_CONDITION)
     if wanted not in conditions:
-        known = f"the recordings have the conditions {', '.join(conditions)}"
-        raise DataError(f"data.identify_on = {wanted!r}: {known}; name one of them.")
+        raise DataError(f"data.identify_on = {wanted!r}: the recordings have the conditions {', '.join(conditions)}.")
     return wanted
 
 

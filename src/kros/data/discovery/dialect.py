@@ -64,8 +64,7 @@ def look_at(path: Path) -> TableHead:
     readings = [(_rows(lines, delimiter), delimiter, decimal) for delimiter, decimal in MARKS]
     rows, delimiter, decimal = max(readings, key=lambda reading: _score(reading[0], reading[2]))
     if _score(rows, decimal)[0] < 2:
-        actual = f"no rows of numbers were found in its first {len(lines)} lines"
-        raise DataError(f"Reading {path}: {actual}; is it a recording?")
+        raise DataError(f"Reading {path}: no rows of numbers were found in its first {len(lines)} lines; check it.")
     return _described(path, rows, Dialect(delimiter=delimiter, decimal=decimal, encoding=encoding))
 
 

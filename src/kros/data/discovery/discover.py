@@ -103,8 +103,7 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], Texts]:
         with suppress(DataError):
             heads.append(look_at(path))
     if not heads:
-        problem = "none of the files looked at holds rows of numbers"
-        raise DataError(f"Looking at {paths[0].parent}: {problem}; check the folder.")
+        raise DataError(f"Looking at {paths[0].parent}: no file looked at holds rows of numbers; check the folder.")
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
     usual = (h for h in heads if (h.dialect, h.fields) == commonest)
     head = max(usual, key=lambda h: sum(map(h.is_numeric, range(len(h.fields)))))  # a sensor may have been off
@@ -154,8 +153,7 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColum
                 samples.append(np.where(np.isfinite(known), known, np.nan)[first].T)
     if not samples:
         tables[0].numbers(places)  # says why not, where it cannot be read
-        problem = "the files have fewer than three rows of numbers; check the folder."
-        raise DataError(f"Looking at {source}: {problem}")
+        raise DataError(f"Looking at {source}: the files have fewer than three rows of numbers; check the folder.")
     return {at: [signals[i] for signals in samples] for i, at in enumerate(places)}
 
 
@@ -202,8 +200,7 @@ def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn
     for column in columns:
         parts = [part for part, of in named.items() if column in of]
         if parts[1:]:
-            problem = f"--measured and --input both name the column {column.name!r}"
-            raise ConfigError(f"Roles: {problem}; name it in one of them.")
+            raise ConfigError(f"Roles: --measured and --input both name {column.name!r}; name it in one of them.")
         part = freed[column.part] if named.get(column.part) else column.part
         decided.append(replace(column, part=parts[0], why="as named") if parts else replace(column, part=part))
     for part, what, option in ((measured, "a measured state", "--measured"), (given, "an input", "--input")):

@@ -32,8 +32,7 @@ def declare_channels(
 ) -> Channels:
     """Return the channels as given, or those that the names declare."""
     if (channels is None) != bool(states):
-        actual = f"found states = {list(states)} and channels = {channels!r}"
-        raise DataError(f"{what}: give the names of states, inputs and measured, or channels, {actual}.")
+        raise DataError(f"{what}: give the names of states, inputs and measured, or channels, found {list(states)}.")
     if channels is not None:
         return tuple(channels)
     for name, value in {"states": states, "inputs": inputs, "measured": measured}.items():
@@ -111,8 +110,7 @@ def from_arrays(
 def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
     """Yield every episode of a mapping from units, from units and conditions, or from keys."""
     if not isinstance(data, Mapping):
-        needs = "needs a mapping from units to lists of episodes"
-        raise DataError(f"from_arrays {needs}, found {shortened(repr(data))}; see its documentation.")
+        raise DataError(f"from_arrays needs a mapping from units to episodes, found {shortened(repr(data))}.")
     for unit, of_unit in data.items():
         if isinstance(unit, EpisodeKey):
             yield unit, of_unit
@@ -131,18 +129,15 @@ def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> Arra
     if isinstance(episode, Mapping):
         missing = next((name for name in names if name not in episode), None)
         if missing is not None:
-            actual = f"channel {missing!r} is missing, found {list(episode)}"
-            raise DataError(f"{title(key)}: {actual}; add it, or correct the names.")
+            raise DataError(f"{title(key)}: channel {missing!r} is missing, found {list(episode)}; correct the names.")
         episode = tuple(episode[name] for name in names)
     try:
         whole = not isinstance(episode, tuple)
         values = as_numbers(episode) if whole else np.column_stack([as_numbers(part) for part in episode])
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        needs = f"needs numbers of shape (n_samples, {len(channels)})"
-        raise DataError(f"{title(key)}: {needs}, found something else ({error}); correct the array.") from error
+        raise DataError(f"{title(key)}: needs numbers, found something else ({error}); correct it.") from error
     if values.ndim != 2 or values.shape[1] != len(channels):
-        needs = f"needs shape (n_samples, {len(channels)}) for the channels {names}"
-        raise DataError(f"{title(key)}: {needs}, found {values.shape}; transpose or correct the array.")
+        raise DataError(f"{title(key)}: needs shape (n_samples, {len(channels)}), found {values.shape}; transpose it.")
     return values
 
 
@@ -192,11 +187,9 @@ def from_frame(
     Population(2 units, 1 condition, 2 episodes every 0.01 s; states x (measured); inputs u)
     """
     if type(frame).__module__.partition(".")[0] != "pandas" or not hasattr(frame, "columns"):
-        actual = f"found {type(frame).__name__}"
-        raise DataError(f"from_frame needs a pandas DataFrame, {actual}; use from_arrays for arrays.")
+        raise DataError(f"from_frame needs a pandas DataFrame, found {type(frame).__name__}; use from_arrays.")
     if (time is None) == (sample_period_s is None):
-        actual = f"found time = {time!r}, sample_period_s = {sample_period_s!r}"
-        raise DataError(f"from_frame needs one of time and sample_period_s, {actual}.")
+        raise DataError(f"from_frame needs one of time and sample_period_s, found {time!r} and {sample_period_s!r}.")
     ordered, known = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame")), list(frame)
     for name in filter(None, (*(c.name for c in ordered), time, unit)):
         if (count := known.count(name)) != 1:
@@ -221,8 +214,7 @@ def _ids(frame: Any, column: str | None, default: str | None) -> list[str]:
     values = frame[column].to_numpy(dtype=object)
     bad = next((v for v in values if isinstance(v, bool) or not isinstance(v, (str, int, np.integer))), None)
     if bad is not None:
-        wanted = f"column {column!r} should hold text or whole numbers, found {bad!r}"
-        raise DataError(f"from_frame: {wanted}; convert it with astype(str), keeping leading zeros.")
+        raise DataError(f"from_frame: column {column!r} should hold text or whole numbers, found {bad!r}; convert it.")
     return [str(v) for v in values]
 
 

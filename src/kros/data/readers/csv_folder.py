@@ -101,8 +101,7 @@ class CsvMapping(Dialect):
     def _consistent(self) -> CsvMapping:
         """Check what a type cannot say."""
         if (self.time is None) == (self.sample_period_s is None):
-            actual = f"time = {self.time!r}, sample_period_s = {self.sample_period_s!r}"
-            raise ValueError(f"give one of time and sample_period_s, found {actual}")
+            raise ValueError(f"give one of time and sample_period_s, found {self.time!r} and {self.sample_period_s!r}")
         if not (_is_mark(self.delimiter) and _is_mark(self.decimal)) or self.delimiter == self.decimal:
             raise ValueError(
                 "delimiter and decimal should be two different characters of ASCII that stand in no number otherwise, "
@@ -116,8 +115,7 @@ class CsvMapping(Dialect):
             if len(set(places)) < len(places):
                 raise ValueError(f"every channel needs a column of its own, found {places}; correct the columns")
             if unknown := sorted(set(unit.columns) - set(names)):
-                gives = f"[[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}"
-                raise ValueError(f"{gives}; the channels are {names}")
+                raise ValueError(f"[[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}; channels are {names}")
         named = next((column for column in self.declared if isinstance(column, str)), None)
         if named is not None and not self.header:
             raise ValueError(f"header = false leaves columns without names, found {named!r}; give its number from 1")
@@ -246,12 +244,10 @@ def read_csv_folder(
             if place.rows != slice(None) and chosen.exclude and re.search(chosen.exclude, part):
                 continue
             if key in places:
-                twice = f"{key} is in {places[key].table.path} and in {path}"
-                raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
+                raise DataError(f"Duplicate episodes: {key} is in {places[key].table.path} and in {path}; remove one.")
             places[key], group = place, named.get("group", "")
             if groups.setdefault(key.unit, group) != group:
-                both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
-                raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
+                raise DataError(f"Unit {key.unit} is in both groups {groups[key.unit]!r} and {group!r} ({path}).")
     time_scale = None if chosen.time is None else chosen.time_scale or 1.0
     recordings = CsvRecordings(places, time_scale, chosen.timestamp)
     channels = tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in chosen.ordered)

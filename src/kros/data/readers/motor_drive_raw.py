@@ -75,13 +75,11 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     """Read the paper's raw layout, sampled at 1 kHz, so steps of time of 1 are ms and of 1000 are us."""
     root, what = find_root(Path(source)), f"Reading {source} as motor-drive-raw"
     if root is None:
-        missing = "found no folder 'population' or 'outliers', nor 'batch_b' with one of them"
-        raise DataError(f"{what}: {missing}; check the path, or set another data.reader.")
+        raise DataError(f"{what}: found no folder 'population' or 'outliers'; set another data.reader.")
     files = [name for name in csv_files(root) if name.endswith(".csv") and name.startswith(GROUPS)]
     strange = next((name for name in files if not re.search(MAPPING.files, name)), None)
     if strange is not None:
-        wanted = "<YYYYmmddTHHMMSS>_<serial, 6 digits>_<load|noload>/*_<episode, 3 digits>.csv"
-        raise DataError(f"{what}: file {root / strange} should be named {wanted}; rename it or move it away.")
+        raise DataError(f"{what}: file {root / strange} should be named <time>_<serial>_<load|noload>/*_<episode>.csv.")
     population = read_csv_folder(root, MAPPING)
     steps = ((scale, population.sample_period_s * scale) for scale in (1e-3, 1e-6))
     scale = next((scale for scale, step in steps if math.isclose(step, PERIOD_S, rel_tol=0.01)), None)

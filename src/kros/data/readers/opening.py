@@ -76,8 +76,7 @@ def read(
         raise ConfigError(f"data.reader should be one of {', '.join(READERS)}, found {reader!r}; correct it.")
     chosen = _fitting(reader, Path(source), mapping is not None)
     if chosen == "csv" and mapping is None:
-        advice = "give mapping= or the table [data.csv] (kros init writes one)"
-        raise ConfigError(f"Reading {source} as csv needs a mapping of columns; {advice}.")
+        raise ConfigError(f"Reading {source} as csv needs a mapping; give mapping=, or [data.csv] by kros init.")
     if chosen != "csv" and mapping is not None:
         problem = "a CSV mapping is given, which only the reader 'csv' uses"
         raise ConfigError(f'Reading {source} as {chosen}: {problem}; remove it or set data.reader = "csv".')
@@ -103,6 +102,5 @@ def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
     if chosen != "csv" and fits not in (chosen, "csv", None):
         raise DataError(f'{reading} as {chosen}: these are {fits} recordings; set data.reader = "{fits}".')
     if chosen is None:
-        problem = "it has neither population.json, nor 'population' and 'outliers', nor CSV files"
-        raise DataError(f"{reading}: no reader fits; {problem}; check data.source.")
+        raise DataError(f"{reading}: no reader fits, and there are no CSV files; check data.source.")
     return chosen

@@ -121,8 +121,7 @@ def read_parquet(folder: Path | str) -> Population:
         index = united(_Index, content, {})
         places = _places(index.groups)
     except ValueError as error:
-        what = f"Reading {folder / 'population.json'}: not as kros writes it"
-        raise DataError(f"{what} ({shortened(str(error))}); {AGAIN}.") from error
+        raise DataError(f"Reading {folder}: not as kros writes it ({shortened(str(error))}); {AGAIN}.") from error
     missing = sorted({name for name, _, _ in places.values() if not (folder / name).is_file()})
     if missing:
         raise DataError(f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; {AGAIN}.")
@@ -200,8 +199,7 @@ def _write_episodes(population: Population, episodes: Episodes, path: Path) -> I
 
     names = [c.name for c in population.columns]
     if clash := sorted({*KEYS, "k"} & set(names)):
-        problem = f"channels {clash} have the name of a key column ({', '.join(KEYS)}, k)"
-        raise DataError(f"Writing Parquet: {problem}; rename them.")
+        raise DataError(f"Writing Parquet: channels {clash} have names of the columns of keys; rename them.")
     kinds = dict.fromkeys(KEYS, pa.dictionary(pa.int32(), pa.string())) | {"k": pa.int64()}
     schema = pa.schema(kinds | dict.fromkeys(names, pa.float64()))
     options: Record = {

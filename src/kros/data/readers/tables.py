@@ -121,11 +121,9 @@ def _columns(path: Path, dialect: Dialect) -> tuple[list[str], list[str]]:
     lines = lines_of(head_of(path, 1000 * needed), dialect.encoding, path)
     lines = (lines if len(lines) > needed else lines_of(head_of(path), dialect.encoding, path))[dialect.skip_rows :]
     if not lines or not lines[0].strip():
-        problem = f"the file is empty, or has no line {dialect.skip_rows + 1}, where its columns should begin"
-        raise DataError(f"Reading {path}: {problem}; restore it, or correct skip_rows.")
+        raise DataError(f"Reading {path}: it is empty, or has no line {dialect.skip_rows + 1}; correct skip_rows.")
     if "\0" in lines[0]:
-        problem = "holds NUL bytes, so it is binary or UTF-16"
-        raise DataError(f"Reading {path}: {problem}; convert it to text in UTF-8, or name the encoding.")
+        raise DataError(f"Reading {path}: holds NUL bytes, so it is binary or UTF-16; name the encoding.")
     try:
         fields, *rows = (cells_of(line, dialect.delimiter) for line in lines[: dialect.unit_rows + 2])
     except csv.Error as error:
@@ -149,8 +147,7 @@ def head_of(path: Path, size: int = HEAD) -> bytes:
     if len(content) < size or b"\0" in content:
         return content
     if ends < 0 and size == HEAD:
-        problem = f"a line at the start is longer than {HEAD} bytes, so this is no table of text"
-        raise DataError(f"Reading {path}: {problem}; check the file and its line ends.")
+        raise DataError(f"Reading {path}: a line at the start is longer than {HEAD} bytes; it is no table of text.")
     return content[: ends + 1]
 
 
@@ -159,8 +156,7 @@ def lines_of(content: bytes, encoding: str, path: Path) -> list[str]:
     try:
         text = codecs.getincrementaldecoder(encoding)().decode(content)
     except UnicodeError as error:
-        problem = f"its first lines are not {encoding.upper()} ({error})"
-        raise DataError(f"Reading {path}: {problem}; name the encoding, such as cp1252 or UTF-16.") from error
+        raise DataError(f"Reading {path}: not {encoding.upper()} ({error}); is it cp1252, UTF-16?") from error
     return re.split("\r\n|\r|\n", re.sub("(\r\n|\r|\n)\\Z", "", text.removeprefix("\ufeff")))
 
 
@@ -189,8 +185,7 @@ class LimitedFile:
         content = self._file.read(BLOCK if size is None or size < 0 else size)
         self._given += len(content)
         if self._given > limits.MAX_TEXT_BYTES:
-            advice = "split it, or raise MAX_TEXT_BYTES in kros.core.limits"
-            raise DataError(f"Reading {self._path}: unpacks to more than {limits.MAX_TEXT_BYTES} bytes; {advice}.")
+            raise DataError(f"Reading {self._path}: unpacks to more than {limits.MAX_TEXT_BYTES} bytes; split it.")
         return content
 
     def close(self) -> None:

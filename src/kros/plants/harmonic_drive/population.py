@@ -175,8 +175,7 @@ class HarmonicDrivePopulation(BatchSettings):
         object.__setattr__(self, "loop", member(Loop, self.loop, "Harmonic Drive population: the loop"))
         object.__setattr__(self, "conditions", tuple(self.conditions))
         if not self.conditions or sorted(self.conditions) != sorted({*self.conditions} & {*CONDITIONS}):
-            wanted = f"should be one or both of {CONDITIONS}, each once"
-            raise ConfigError(f"Harmonic Drive population: conditions {self.conditions} {wanted}.")
+            raise ConfigError(f"Harmonic Drive population: conditions {self.conditions} should be among {CONDITIONS}.")
 
     def simulate(self) -> SimulatedPopulation[Truth]:
         """Simulate all episodes of all units, as the reader of the raw layout yields them and, `raw`, as recorded.

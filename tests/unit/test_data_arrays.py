@@ -68,8 +68,8 @@ def test_names_in_place_of_channels() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"measured": []}, r"measured should name the states that a running observer will be given, found \[\]"),
-        ({"measured": ["u"]}, r"measured should name .*found \['u'\] for the states \['x', 'v'\]"),
+        ({"measured": []}, r"measured should name some of the states .*, found \[\]"),
+        ({"measured": ["u"]}, r"measured should name some of the states \['x', 'v'\], found \['u'\]"),
         ({"states": "x"}, r"states should be a list of names, found the text 'x'; write \['x'\]"),
         ({"states": []}, "give the names of states, inputs and measured, or channels"),
         ({"channels": CHANNELS}, "give the names of states, inputs and measured, or channels"),

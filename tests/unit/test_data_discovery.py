@@ -258,7 +258,7 @@ def test_episodes_that_are_too_short_are_left_out_before_anything_is_computed(tm
     del files["motor1/run1.csv"][62:]
     found = discover(written(tmp_path, files), fewest=65)
     assert found.findings == ("left out, motor1/run1.csv: it has 60 samples that can be used, and kros run needs 65",)
-    with pytest.raises(DataError, match=r"none of 6 episodes can be used; episode .*: it has .* kros run needs 200"):
+    with pytest.raises(DataError, match=r"none of 6 episodes can be used; it has .* kros run needs 200"):
         discover(tmp_path, fewest=200)
 
 

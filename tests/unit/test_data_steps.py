@@ -38,7 +38,7 @@ def test_offset_is_the_mean_difference_over_its_window() -> None:
     values = counting()
     result = prepare(population(values), [steps.Offset("x", "u", 2, 4)]).read(KEY)
     np.testing.assert_allclose(result - values, np.tile([200.0, 0, 0], (10, 1)))
-    with pytest.raises(DataError, match="calibrated over samples 2-10, the episode has 10"):
+    with pytest.raises(DataError, match="the offset needs 11 samples, found 10"):
         prepare(population(values), [steps.Offset("x", "u", 2, 11)]).read(KEY)
 
 

@@ -26,7 +26,7 @@ def samples(units: int = 2, draws: int = 40, spread: float = 0.02) -> ModelSampl
 
 @pytest.mark.parametrize(("episodes", "draws"), [([3, 1], 10), ([3, 3], 1), ([], 10)])
 def test_too_little_to_draw_from_is_refused(episodes: list[int], draws: int) -> None:
-    with pytest.raises(DataError, match="at least two episodes"):
+    with pytest.raises(DataError, match="needs two episodes of every unit"):
         episode_weights(episodes, draws, 0)
 
 

@@ -191,5 +191,5 @@ def test_an_input_that_rests_in_all_recordings_is_named():
     one = Factor.stack([reduce_episode(x, u, linear), reduce_episode(x, still, linear)])
     require_excitation(one, INPUTS, "load")
     silent = Factor.stack([reduce_episode(x, still, linear)] * 2)
-    with pytest.raises(IdentificationError, match=r"\(load\): input 'target' is zero .* declare it as another role"):
+    with pytest.raises(IdentificationError, match=r"Input 'target' is zero .* \(load\); drop the channel"):
         require_excitation(silent, INPUTS, "load")

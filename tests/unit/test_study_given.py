@@ -88,7 +88,7 @@ def test_a_condition_whose_units_cannot_be_calibrated_has_no_models():
     models = kros.identify(given, refine=False)
     assert models.conditions == ("noload",)
     assert set(models.sizes) == set(given.states + given.inputs)
-    with pytest.raises(IdentificationError, match="condition 'load': none of its units"):
+    with pytest.raises(IdentificationError, match="No unit could be calibrated in 'load'"):
         kros.identify(given, refine=False, identify_on="load")
 
 

@@ -328,9 +328,6 @@ def split_episodes(population: Population, test: Iterable[str] | None = None) ->
         names = {k.episode for k in ordered[-max(1, len(ordered) // 10) :]} if named is None else named
         train, tested = (tuple(k for k in ordered if (k.episode in names) is part) for part in (False, True))
         if not train or not tested:
-            raise DataError(
-                f"{where}: split.test = {sorted(names, key=natural_key)} leaves {len(train)} for training and "
-                f"{len(tested)} for testing of {[k.episode for k in ordered]}; name some of them, not all."
-            )
+            raise DataError(f"{where}: split.test leaves {len(train)} for training and {len(tested)} for testing.")
         splits[unit, condition] = Split(train, tested)
     return splits

@@ -192,8 +192,7 @@ class Offset(Step):
         columns = self.columns((self.channel, self.reference), channels)
         if len(recording.values) < self.stop:
             raise DataError(
-                f"{title(recording.key)}: the offset of {self.channel!r} is calibrated over samples "
-                f"{self.start}-{self.stop - 1}, the episode has {len(recording.values)}; leave the episode out."
+                f"{title(recording.key)}: the offset needs {self.stop} samples, found {len(recording.values)}."
             )
         window = recording.values[self.start : self.stop, columns]
         check_finite(window, recording.key, [channels[i] for i in columns], first=self.start)
@@ -222,10 +221,7 @@ class Trim(Step):
         n = len(recording.values)
         stop = min(n if self.stop is None else self.stop, n - self.tail)
         if stop <= self.start:
-            raise DataError(
-                f"{title(recording.key)}: trimming to start = {self.start}, stop = {self.stop}, tail = {self.tail} "
-                f"leaves nothing of {n} samples; leave the episode out or trim less."
-            )
+            raise DataError(f"{title(recording.key)}: {self} leaves nothing of {n} samples; leave it out.")
         return recording.cut(self.start, stop)
 
 

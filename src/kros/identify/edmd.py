@@ -167,9 +167,7 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
     if first is None:
         return 0.0 if _stable_without(factors, margin) else float(grid[-1])
     if first == 0:
-        raise IdentificationError(
-            f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}."
-        )
+        raise IdentificationError(f"EDMD: models stay unstable up to alpha = {grid[0]:.1e}, with a margin of {margin}.")
     low, high = np.log10(grid[first]), np.log10(grid[first - 1])
     for _ in range(search.bisections):
         middle = (low + high) / 2
@@ -208,10 +206,7 @@ def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     """Draw E - 1 of E episodes with replacement, and return how much each counts: (unit, draw, max(n_episodes))."""
     counts = list(n_episodes)
     if not counts or min(counts) < 2 or draws < 2:
-        raise DataError(
-            f"Resampling episodes: needs at least two episodes of every unit and two draws, found {counts} episodes of "
-            f"the units and {draws} draws; record more, or leave the unit out."
-        )
+        raise DataError(f"Resampling needs two episodes of every unit and two draws, found {counts} and {draws}.")
     weights = np.zeros((len(counts), draws, max(counts)))
     for row, E in enumerate(counts):
         rng = np.random.default_rng([seed, row])

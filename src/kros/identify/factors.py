@@ -162,12 +162,9 @@ def _widened(
 
 def require_excitation(factor: Factor, inputs: Sequence[str], where: str) -> None:
     """Refuse recorded inputs that are zero in all training episodes of linear models."""
-    at_rest = factor.peak.max(axis=0)[-len(inputs) :] == 0
-    if at_rest.any():
-        raise IdentificationError(
-            f"Identifying ({where}): input {inputs[int(at_rest.argmax())]!r} is zero in all training episodes, so the "
-            "response to it is not in the recordings; declare it as another role, or drop the channel."
-        )
+    peaks = factor.peak.max(axis=0)[-len(inputs) :]
+    if resting := [name for name, peak in zip(inputs, peaks, strict=True) if peak == 0]:
+        raise IdentificationError(f"Input {resting[0]!r} is zero in all training episodes ({where}); drop the channel.")
 
 
 @frozen

@@ -106,10 +106,7 @@ def with_models(base: IdentifiedModels, settings: IdentifySettings, work: Work) 
     """
     facts = base.facts
     if facts.identify_on not in base.conditions:
-        raise IdentificationError(
-            f"Identifying in condition {facts.identify_on!r}: none of its units could be calibrated; set "
-            "data.identify_on to another one."
-        )
+        raise IdentificationError(f"No unit could be calibrated in {facts.identify_on!r}; set data.identify_on.")
     elsewhere = [u for u in facts.pooled if not facts.keys("train", u, facts.identify_on)]
     if elsewhere:
         text = "Units %s were not recorded in condition %r, which feeds synthesis, and take no part in it"

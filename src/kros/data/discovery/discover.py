@@ -175,9 +175,7 @@ def _time(
     called = next((c.header for c in columns if c.kind == "time"), None)
     problem = f"{called!r} stands still or runs back in places, as rounded times do" if called else "no column is time"
     found = ", ".join(repr(c.header) for c in columns)
-    raise DataError(
-        f"Looking at {source}: {problem}, found the columns {found}; give --period SECONDS, or name labels."
-    )
+    raise DataError(f"Looking at {source}: {problem}, found {found}; give --period SECONDS, or name labels.")
 
 
 def _channel(column: TableColumn) -> Record:
@@ -242,9 +240,7 @@ def _examined(source: Path, draft: Discovery, excluded: Sequence[str], fewest: i
     wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
     counts = Counter((s.key.unit, s.key.condition) for s in good)
     if not counts:
-        raise DataError(
-            f"Looking at {source}: none of {len(looks)} episodes can be used; {looks[0].key}: {looks[0].wrong}"
-        )
+        raise DataError(f"Looking at {source}: none of {len(looks)} episodes can be used; {looks[0].wrong}")
     files = _files_of(population, source)
     findings += [f"left out, {files[key]}: {why}" for key, why in wrong.items()]
     usual = np.median([s.n_samples for s in good])

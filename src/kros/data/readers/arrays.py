@@ -39,10 +39,7 @@ def declare_channels(
         if isinstance(value, str):
             raise DataError(f"{what}: {name} should be a list of names, found the text {value!r}; write [{value!r}].")
     if not measured or not set(measured) <= set(states):
-        raise DataError(
-            f"{what}: measured should name the states that a running observer will be given, found {list(measured)} "
-            f"for the states {list(states)}; name one of them at least."
-        )
+        raise DataError(f"{what}: measured should name some of the states {list(states)}, found {list(measured)}.")
     recorded = (Channel(s, Role.STATE, measured=s in measured) for s in states)
     return (*recorded, *(Channel(u, Role.INPUT) for u in inputs))
 

@@ -143,10 +143,7 @@ def _choose(scores: Array, options: RefineOptions) -> int:
     """Return the strongest prior about as good as the best."""
     best = float(np.min(scores))
     if not np.isfinite(best):
-        raise IdentificationError(
-            "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add "
-            f"strengths above {max(options.strengths):g}."
-        )
+        raise IdentificationError("Refinement: a free run over held-out training data diverges; use stronger priors.")
     return int(np.argmax(scores <= (1 + options.tolerance) * best))
 
 

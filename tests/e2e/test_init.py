@@ -130,7 +130,7 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
     assert kros("run", study, "--out", tmp_path / "run", "--until", "read").exit_code == 0
     for change, message in (
         ("time_scale=nan", "data.csv.time_scale: input should be a finite number, found nan"),
-        ("encoding=utf-16", "its first lines are not UTF-16 (UTF-16 stream does not start with BOM)"),
+        ("encoding=utf-16", "not UTF-16 (UTF-16 stream does not start with BOM)"),
         ("pieces=100000", "pieces: input should be less than or equal to 1000, found 100000"),
     ):
         result = kros("run", study, "--out", tmp_path / "no", "--until", "read", "--set", f"data.csv.{change}")
@@ -154,7 +154,7 @@ def test_roles_are_taken_from_options(kros, tmp_path, motors):
     name = "no column is a measured state by its name; name it, --measured NAME. The columns are aa, bb, cc, dd"
     refused(name, *period)
     refused("there is no column 'd'", *period, "--measured", "aa", "--input", "d")
-    refused("--measured and --input both name the column 'aa'", *period, "--measured", "aa", "--input", "aa")
+    refused("--measured and --input both name 'aa'", *period, "--measured", "aa", "--input", "aa")
     refused("sample_period_s: input should be greater than 0, found 0.0", "--period", 0, *roles)
     result = kros("init", folder, "--out", study, *period, *roles)
     assert result.exit_code == 0, result.output

@@ -120,7 +120,7 @@ def test_columns_that_are_missing_or_double(folder: Path, header: str, message: 
         ("0.5,1,off", r"cold_1\.csv: in column 'volt'.*'off'"),
         ("0.5,,1", r"Episode 1 of unit a \(cold\): channel 'x' has 1 NaN at sample 50"),
         ("0.5,1,inf", "channel 'u' has 1 infinity at sample 50"),
-        ("0.505,1,1", r"uneven time, 1 of 50 steps .* 0\.015 s at sample 49"),
+        ("0.505,1,1", r"uneven time, .* 0\.015 s at sample 49"),
     ],
 )
 def test_bad_rows(folder: Path, row: str, message: str) -> None:
@@ -145,7 +145,7 @@ def test_duplicates_and_no_match(folder: Path) -> None:
 def test_another_rate(folder: Path) -> None:
     write(folder / "b" / "cold_1.csv", samples(0) * [2, 1, 1])
     with pytest.raises(
-        DataError, match=r"0\.01 s in episode 1 of unit a \(cold\) and 0\.02 s in episode 1 of unit b \(cold\)"
+        DataError, match=r"unit b \(cold\).* not the 0\.01 s of episode 1 of unit a \(cold\): found steps of 0\.02 s"
     ):
         read_first(folder, "b")
 

@@ -70,11 +70,13 @@ class Recording:
 
     def usable(self, period_s: float) -> Recording:
         """Return the same without samples that hold NaN or infinity, with the time of the others, if two remain."""
-        usable_rows = usable(self.values).all(axis=1)
-        usable_rows |= usable_rows.sum() < 2  # nothing to bridge: the check of the episode says what is wrong
-        even = np.arange(len(self.values), dtype=np.float64) * period_s
-        time = even if self.time_s is None else self.time_s
-        return replace(self, values=self.values[usable_rows], time_s=time[usable_rows])
+        rows = usable(self.values).all(axis=1)
+        rows |= rows.sum() < 2  # nothing to bridge: the check of the episode says what is wrong
+        return replace(self, values=self.values[rows], time_s=self.times(period_s)[rows])
+
+    def times(self, period_s: float) -> Array:
+        """Return the time of every sample, even where none is recorded."""
+        return np.arange(len(self.values), dtype=np.float64) * period_s if self.time_s is None else self.time_s
 
 
 @frozen
@@ -136,11 +138,10 @@ def check_increasing(recording: Recording, where: str = "") -> None:
     bad = np.flatnonzero(~(np.diff(time) > 0))
     if bad.size:
         k, mean = int(bad[0]), (time[-1] - time[0]) / (len(time) - 1)
-        rounded = f"if stamps are rounded, give the period in their place, --period {mean:.3g} or sample_period_s"
         raise DataError(
             f"{title(recording.key)}{where}: time should increase, found {time[k]:.9g} s at sample {k} and "
-            f"{time[k + 1]:.9g} s at sample {k + 1} ({len(bad)} such steps); "
-            f"{rounded if (np.diff(time) >= 0).all() else 'sort samples by time'}."
+            f"{time[k + 1]:.9g} s at sample {k + 1} ({len(bad)} such steps); sort samples by time, or if stamps are "
+            f"rounded, give the period in their place, --period {mean:.3g} or sample_period_s."
         )
 
 
@@ -152,20 +153,12 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, whe
     check_increasing(recording, where)
     steps, period = np.diff(time), estimate_period(recording)
     deviation = np.abs(steps - period)
-    worst = int(deviation.argmax())
-    step = 'declare [[data.prepare]] step = "resample"'
-    if deviation[worst] > CHECK.time * period:
-        count = np.count_nonzero(deviation > CHECK.time * period)
+    worst, room = int(deviation.argmax()), max(CHECK.period, CHECK.time / len(steps))
+    if deviation[worst] > CHECK.time * period or abs(steps.mean() - period_s) > room * period_s:
         raise DataError(
-            f"{title(recording.key)}{where}: uneven time, {count} of {len(steps)} steps differ from {period:g} s by "
-            f"more than {CHECK.time:g} of it, the worst {steps[worst]:g} s at sample {worst}; {step}, "
-            f"period_s = {period:.3g}, or fix the source."
-        )
-    mean = float((time[-1] - time[0]) / len(steps))
-    if abs(mean - period_s) > max(CHECK.period, CHECK.time / len(steps)) * period_s:
-        raise DataError(
-            f"Two sampling periods: {period_s:g} s in {reference} and {period:g} s in {recording.key}{where}; a "
-            f"population has one, {step}, period_s = {max(period, period_s):g}, or leave one out."
+            f"{title(recording.key)}{where}: uneven time, or not the {period_s:g} s of {reference}: found steps of "
+            f"{period:g} s, and {steps[worst]:g} s at sample {worst}; declare "
+            f'[[data.prepare]] step = "resample", period_s = {max(period, period_s):.3g}, or fix the source.'
         )
 
 

@@ -255,8 +255,7 @@ class Resample(Step):
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording on the new grid, which starts at its first sample."""
-        time, what = recording.time_s, f"{title(recording.key)}: resampling"
-        time = np.arange(len(recording.values), dtype=np.float64) * period_s if time is None else time
+        time = recording.times(period_s)
         timed = replace(recording, time_s=time)
         check_increasing(timed)
         start, stop = longest_stretch(time, self.max_gap_s or GAP * estimate_period(timed))
@@ -264,7 +263,7 @@ class Resample(Step):
         median = estimate_period(timed)
         count = (time[-1] - time[0]) / min(self.period_s, median)
         if count > limits.MAX_SAMPLES:
-            raise DataError(f"{what} to {self.period_s:g} s would make {count:g} samples; correct the period.")
+            raise DataError(f"{title(recording.key)}: resampling would make {count:g} samples; correct the period.")
         return replace(recording, values=self.on_grid(time, timed.values, median), time_s=None)
 
     def on_grid(self, time_s: Array, values: Array, median_s: float) -> Array:

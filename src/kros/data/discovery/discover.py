@@ -18,7 +18,7 @@ from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_
 from ...core.arrays import Texts
 from ..measures import split_header
 from ..population import EpisodeKey, Population, Role
-from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, part_of, read_csv_folder
+from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder
 from ..readers.tables import Table
 from ..recording import CHECK, some, usable
 from ..steps import GAP
@@ -258,9 +258,7 @@ def _examined(source: Path, draft: Discovery, excluded: Sequence[str], fewest: i
     for unit, condition in few:
         wrong |= dict.fromkeys(population.keys(unit, condition), "the only episode of its unit and condition")
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
-    retained = {path for key, path in files.items() if key not in wrong}
-    unusable = [part_of(files[key], key) if files[key] in retained else files[key] for key in wrong]
-    mapping = mapping | _exclusion([*excluded, *unusable])
+    mapping = mapping | _exclusion([*excluded, *(files[key] for key in wrong)])
     prepare, text = _resampling(files, good)
     return replace(draft, mapping=mapping, prepare=prepare, notes=notes, findings=(*findings, *text))
 
@@ -268,19 +266,16 @@ def _examined(source: Path, draft: Discovery, excluded: Sequence[str], fewest: i
 def _resampling(files: Mapping[EpisodeKey, str], looks: Sequence[EpisodeLook]) -> tuple[tuple[Record, ...], list[str]]:
     """Return the step that makes time even or bridges NaN, and a sentence about it; nothing where neither is needed."""
     median, worst = float(np.median([s.period_s for s in looks])), max(looks, key=lambda s: s.uneven)
-    period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
-    even = not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks)
-    bridged = sum(s.nan for s in looks)
-    if even and not bridged:
+    period_s, nan = float(f"{median:.3g}"), sum(s.nan for s in looks)
+    differ = worst.uneven[0] > CHECK.time or any(abs(s.period_s - median) > CHECK.period * median for s in looks)
+    if not (differ or nan):
         return (), []
-    ends = (f"{end(s.period_s for s in looks):.4g}" for end in (min, max))
-    recorded = f"(recorded at {' to '.join(dict.fromkeys(ends))} s)"
-    text = "time is uneven" if uneven else "sampling periods differ"
-    text = f"NaN in {bridged} episodes is bridged by straight lines" if even else text
-    text += f": all episodes are resampled to a period of {period_s:g} s {recorded}"
-    if uneven:
-        where = f"at sample {worst.uneven[1]} of {files[worst.key]}"
-        text += f", the worst step differs by {worst.uneven[0] * period_s:.3g} s {where}"
+    text = f"NaN in {nan} episodes is bridged by straight lines"
+    if differ:
+        ends = " to ".join(dict.fromkeys(f"{end(s.period_s for s in looks):.4g}" for end in (min, max)))
+        where = f"by {worst.uneven[0] * period_s:.3g} s at sample {worst.uneven[1]} of {files[worst.key]}"
+        text = f"time is uneven, or periods differ (recorded at {ends} s), the worst step differs {where}"
+    text += f"; all episodes are resampled to a period of {period_s:g} s"
     text += f"; where a step is longer than {GAP:g} periods, the longest stretch without such a gap is taken"
     return ({"step": "resample", "period_s": period_s},), [text]
 

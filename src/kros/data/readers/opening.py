@@ -95,8 +95,6 @@ def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
         raise DataError(f"{reading}: there is no such folder; check data.source.")
     if not source.is_dir():
         raise DataError(f"{reading}: this is a file, and recordings are a folder; give the folder that holds it.")
-    if not any(source.iterdir()):
-        raise DataError(f"{reading}: the folder is empty; check data.source or record something.")
     fits = detect_reader(source)
     chosen = "csv" if reader is None and with_mapping else reader or fits  # a mapping takes any layout
     if chosen != "csv" and fits not in (chosen, "csv", None):

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -97,6 +97,10 @@ class Table:
         try:
             with opened(self.path, dialect.encoding) as file:
                 for batch in arrow.open_csv(pa.PythonFile(file, mode="r"), *options):
+                    if file.tell() > limits.MAX_TEXT_BYTES:
+                        raise DataError(
+                            f"Reading {self.path}: unpacks to more than {limits.MAX_TEXT_BYTES} bytes; split it."
+                        )
                     yield [batch.column(names[i]) for i in wanted]
         except DataError:
             raise
@@ -140,9 +144,7 @@ def _columns(path: Path, dialect: Dialect) -> tuple[list[str], list[str]]:
 def head_of(path: Path, size: int = HEAD) -> bytes:
     """Return the first bytes of a text file, without a last line that is cut."""
     with opened(path) as file:
-        content = b""
-        while len(content) < size and (more := file.read(size - len(content))):
-            content += more
+        content: bytes = file.read(size)
     ends = max(content.rfind(b"\n"), content.rfind(b"\r"))
     if len(content) < size or b"\0" in content:
         return content
@@ -173,35 +175,15 @@ def stretches(columns: Sequence[Sequence[Any]]) -> Iterator[tuple[tuple[Any, ...
         yield state, slice(first, start)
 
 
-class LimitedFile:
-    """An open file that gives no more than is ever read; text that was packed too tightly is refused."""
-
-    def __init__(self, file: IO[bytes], path: Path) -> None:
-        self._file, self._path = file, path
-        self._given, self.closed = 0, False
-
-    def read(self, size: int = -1) -> bytes:
-        """Return the next bytes."""
-        content = self._file.read(BLOCK if size is None or size < 0 else size)
-        self._given += len(content)
-        if self._given > limits.MAX_TEXT_BYTES:
-            raise DataError(f"Reading {self._path}: unpacks to more than {limits.MAX_TEXT_BYTES} bytes; split it.")
-        return content
-
-    def close(self) -> None:
-        """Mark the file as read."""
-        self.closed = True
-
-
 @contextmanager
-def opened(path: Path, encoding: str = "utf-8") -> Iterator[LimitedFile]:
+def opened(path: Path, encoding: str = "utf-8") -> Iterator[Any]:
     """Open a regular text file, unpacked where it ends in ``.gz``, as UTF-8."""
     require_regular(path, limits.MAX_TEXT_BYTES)
     opener: Any = gzip.open if path.suffix == ".gz" else open
     try:
         with opener(path, "rb") as file:
             is_utf8 = codecs.lookup(encoding).name == "utf-8"
-            yield LimitedFile(file if is_utf8 else codecs.EncodedFile(file, "utf-8", encoding), path)
+            yield file if is_utf8 else codecs.EncodedFile(file, "utf-8", encoding)
     except (OSError, EOFError, zlib.error, UnicodeError) as error:
         raise DataError(f"Reading {path}: cannot be read ({error}); check the file, or restore it.") from error
 

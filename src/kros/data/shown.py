@@ -19,6 +19,9 @@ class Shown:
         rows = ((name, value) for name, value in self._summary_rows().items() if value not in (None, ""))
         return [(name, f"{value:.4g}" if isinstance(value, float) else str(value)) for name, value in rows]
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {', '.join(f'{name} {text}' for name, text in self._texts)}>"
+
     def summary(self) -> str:
         """Return what it is in a few aligned lines, for `print`; notebooks show the same as a table."""
         width = max(len(name) for name, _ in self._texts)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
 from ..core import AnyArray, Array, ArrayLike, Names, Record, StateSpace
-from ..core.artifacts import Storable, divided, load_artifact, loader, save_artifact, united
+from ..core.artifacts import Storable
 from ..core.frequency import log_grid
 from ..data import Role, Shown
 from ..data.population import Channels
@@ -50,29 +49,6 @@ class ModelSet(Shown, Storable):
     alpha_in_ranges: bool = False  # whether alpha is for channels divided by the ranges or for the recordings' units
     status: Names = field(default=())  # per unit ``ok``, or what is wrong
     longest_s: float | None = None  # longest episode, below whose inverse the models know no frequency, where known
-
-    def save(self, folder: Path) -> None:
-        """Write ``model.json``, with formulas and the parameters of units by name, and ``arrays.npz``."""
-        content, arrays = divided(replace(self, parameters={}))
-        parameters = {name: dict(zip(self.unit_ids, v.tolist(), strict=True)) for name, v in self.parameters.items()}
-        facts = {"lifting": list(self.lifting.functions), "lifting_fields": content["lifting"]}
-        save_artifact(folder, self.KIND, content | facts | {"parameters": parameters}, arrays)
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> ModelSet:
-        """Read what `save` wrote."""
-        content, arrays = load_artifact(folder, cls.KIND)
-        units, by_name = content["unit_ids"], content["parameters"].items()
-        parameters = {name: np.array([values[unit] for unit in units]) for name, values in by_name}
-        whole = content | {"lifting": content["lifting_fields"], "parameters": parameters}
-        models: ModelSet = united(cls, whole, arrays)
-        return models
-
-    def __repr__(self) -> str:
-        units = f"{len(self.unit_ids)} units in condition {self.condition!r}"
-        outputs, inputs = ", ".join(self.lifting.names), ", ".join(self.inputs)
-        return f"ModelSet({self.name!r}: {units}; lifted states {outputs}; inputs {inputs})"
 
     def _summary_rows(self) -> Record:
         functions = self.lifting.functions + self.lifting.input_functions

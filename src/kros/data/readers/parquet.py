@@ -21,7 +21,8 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core import Array, DataError, Names, Record, frozen, load_artifact, save_artifact, united
+from ...core import Array, DataError, Names, Record, Storable, frozen
+from ...core.artifacts import as_written
 from ...core.files import draft_beside, pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
 from ..population import Channels, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
@@ -116,12 +117,9 @@ def read_parquet(folder: Path | str) -> Population:
     ('a',)
     """
     folder = Path(folder)
-    content, _ = load_artifact(folder, INDEX)
-    try:
-        index = united(_Index, content, {})
+    index = PopulationIndex.load(folder)
+    with as_written("population", folder):
         places = _places(index.groups)
-    except ValueError as error:
-        raise DataError(f"Reading {folder}: not as kros writes it ({shortened(str(error))}); {AGAIN}.") from error
     missing = sorted({name for name, _, _ in places.values() if not (folder / name).is_file()})
     if missing:
         raise DataError(f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; {AGAIN}.")
@@ -148,9 +146,10 @@ class GroupRecord:
 
 
 @dataclass(frozen=True)
-class _Index:
+class PopulationIndex(Storable):
     """Content of `population.json`."""
 
+    KIND = INDEX
     sample_period_s: float
     channels: Channels
     units: tuple[Unit, ...]
@@ -167,8 +166,8 @@ def _places(groups: Iterable[GroupRecord]) -> dict[EpisodeKey, Place]:
         if g.file in ("", ".", "..") or Path(g.file).name != g.file:
             raise ValueError(f"the file {g.file!r} is not beside the index")
         for row_group, (key, samples) in enumerate(zip(g.keys, g.samples, strict=True)):
-            if key in places or samples < 0:
-                raise ValueError(f"{key} occurs twice, or has {samples} samples")
+            if key in places:
+                raise ValueError(f"{key} occurs twice")
             places[key] = g.file, row_group, samples
     return places
 
@@ -228,8 +227,9 @@ def write_index(
     if converted:
         scaling = {name: replace(scale, converted=scale.factor) for name, scale in scaling.items()}
     facts = (population.sample_period_s, population.channels, population.units, dict(population.metadata))
-    index = _Index(*facts, tuple(replace(g, digests=()) for g in groups), population.truths, scaling)
-    save_artifact(Path(folder), INDEX, vars(index))
+    PopulationIndex(*facts, tuple(replace(g, digests=()) for g in groups), population.truths, scaling).save(
+        Path(folder)
+    )
 
 
 def write_parquet(population: Population, out: Path | str, converted: bool = True) -> None:

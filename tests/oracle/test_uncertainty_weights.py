@@ -10,7 +10,7 @@ import pytest
 from residuals import of_function
 from scipy.linalg import expm
 
-from kros.core import StateSpace
+from kros.core import DataError, StateSpace
 from kros.uncertainty import quantify
 from kros.uncertainty.weights.cover import NEPER_DB
 from kros.uncertainty.weights.fit import fit_weight
@@ -73,6 +73,14 @@ def test_lightly_damped_units_of_any_order_get_a_weight(angles: tuple[float, ...
     assert found.weight.left.is_stable()
     assert max(found.weight.left_orders) <= order
     assert found.cover_max <= 1
+
+
+@pytest.mark.parametrize("points", [20, 60])
+def test_modes_that_only_the_dense_check_resolves_are_fitted(points: int) -> None:
+    """Entries of order four are within the tolerance of three modes; from frequencies that miss them they were not."""
+    units = [single(0.98, angle, gain) for angle, gain in ((0.3, 1.0), (0.303, 1.1), (0.297, 0.9))]
+    found = quantify(units, "additive", np.geomspace(1e-4, 0.4999, points), max_order=4, tolerance_db=1.0)
+    assert found.overbound_db_max <= 1
 
 
 def resonances(freqs: Array) -> Array:
@@ -152,6 +160,13 @@ def test_identical_units_and_single_frequencies_get_weights() -> None:
     pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
     for freqs in ([0.1], [0.0, 0.5], [0.5]):
         assert quantify(pair, "additive", freqs, max_order=2).cover_max <= 1
+
+
+def test_units_that_are_alike_only_at_the_frequencies_given_are_refused() -> None:
+    """`(z - 1) / (z - p)` is zero at DC, whatever p."""
+    units = [StateSpace([[p]], [[1.0]], [[p - 1]], [[1.0]], 1.0) for p in (0.5, 0.6, 0.75)]
+    with pytest.raises(DataError, match="differ elsewhere"):
+        quantify(units, "additive", [0.0])
 
 
 def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:

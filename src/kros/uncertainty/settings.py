@@ -66,7 +66,7 @@ class MagnitudeRule:
     """Fit of one magnitude by quadratic programs, and its spectral factor."""
 
     floor: float = 1e-8  # of the largest magnitude: smaller ones count as that (-160 dB)
-    exact: float = 10**1e-5  # ratio of squared magnitudes, 1e-4 dB, that counts as one
+    exact_db: float = 1e-4  # excess that counts as none
     highest: float = 10.0  # tau of the highest knot: 80 % of Nyquist
     rounds: int = 6  # of programs: frequencies at which n or d vanish between points join them
     edge: float = 1e-4  # share to which n and d may fall between the ends of the grid and DC or Nyquist
@@ -74,7 +74,6 @@ class MagnitudeRule:
     settled: float = 1 - ITERATED  # ratio of steps of Dinkelbach's iteration that ends it
     damping: float = 3e-3  # least, of a pair of zeros or poles
     widest: float = 40.0  # y of a pair: two real ones 17 decades apart
-    digits: int = 30  # of the arithmetic of roots, which spread over twice as many decades as frequencies
 
 
 @dataclass(frozen=True)

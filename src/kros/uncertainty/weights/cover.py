@@ -19,6 +19,9 @@ Weights are stable systems that are above a cover, `E_k = W_L Delta_k W_R` with 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from ...core import EPS, TINY, AnyArray, ArrayLike, StateSpace, frozen
@@ -72,78 +75,59 @@ class Weight:
 
 def optimal_cover(E: AnyArray) -> Cover:
     """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes."""
-    p = E.shape[2]
-    x = _descend(entries_first(E), p)
+    p, x = E.shape[2], np.zeros((sum(E.shape[2:]), E.shape[1]))
+    alive = np.flatnonzero(E.any(axis=(0, 2, 3)))
+    if alive.size:
+        chosen = alive[evenly(len(alive), FIT.covered)]
+        x = np.array([np.interp(np.arange(E.shape[1]), chosen, row) for row in _descend(entries_first(E[:, chosen]))])
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
     shape = Cover(np.exp(x[:p]).T, right)
     return Cover(shape.left * shape.ratio(E).max(axis=0)[:, None], right)
 
 
-def _descend(first: AnyArray, p: int) -> AnyArray:
-    """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
-    size = sigma_max_first(first).max(axis=0)
-    alive = np.flatnonzero(size > 0)
-    n = first.shape[0] + first.shape[1]
-    if not alive.size:
-        return np.zeros((n, len(size)))
-    chosen = alive[evenly(len(alive), FIT.covered)]
-    E = first[..., chosen] / size[chosen]
+def _descend(E: AnyArray) -> AnyArray:
+    """Minimise the smoothed cost of residuals (p', m', unit, frequency) over x of shape (p' + m', frequency)."""
     leading = np.argsort(-sigma_max_first(E), axis=0)[: FIT.units]  # all others are covered by the scale
-    E = E[:, :, np.unique(leading)]
-    x = np.zeros((n, len(chosen)))
+    E, x = E[:, :, np.unique(leading)], np.zeros((E.shape[0] + E.shape[1], E.shape[3]))
     for squarings in FIT.squarings:
         for _ in range(FIT.steps):
-            before, x = x, _newton(_Smooth(E, p, squarings), x)
+            before, x = x, _newton(partial(_smoothed, E, squarings), x)
             if np.abs(x - before).max() < PROOF.rounding:
                 break
-    return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
+    return x
 
 
-@frozen
-class _Smooth:
-    """The smoothed cost of residuals (p', m', unit, frequency)."""
-
-    E: AnyArray
-    p: int
-    squarings: int
-
-    def cost(self, x: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """Return the cost, shape (frequency,), and its gradient, shape of x."""
-        p, m = self.p, len(x) - self.p
-        M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
-        # no smaller than the largest singular value, and at most four times
-        top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))
-        M = M / top
-        wide = p <= m
-        other = np.conj(np.swapaxes(M, 0, 1))
-        power = multiply(M, other) if wide else multiply(other, M)
-        for _ in range(self.squarings):
-            power = multiply(power, power)
-        Y = multiply(power, M) if wide else multiply(M, power)
-        marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
-        total = marginal.sum(axis=(0, 1))
-        log_s = np.log(top) + np.log(total) / (2 * (2**self.squarings + 1))
-        cost = x[:p].mean(axis=0) + x[p:].mean(axis=0) + log_s + FIT.pull / 2 * (x**2).sum(axis=0)
-        gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
-        return cost, gradient + FIT.pull * x
+def _smoothed(E: AnyArray, squarings: int, x: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Return the smoothed cost, shape (frequency,), and its gradient, shape of x."""
+    p, m = E.shape[:2]
+    M = E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
+    # no smaller than the largest singular value, and at most four times
+    top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))
+    M = M / top
+    wide = p <= m
+    other = np.conj(np.swapaxes(M, 0, 1))
+    power = multiply(M, other) if wide else multiply(other, M)
+    for _ in range(squarings):
+        power = multiply(power, power)
+    Y = multiply(power, M) if wide else multiply(M, power)
+    marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
+    total = marginal.sum(axis=(0, 1))
+    log_s = np.log(top) + np.log(total) / (2 * (2**squarings + 1))
+    cost = x[:p].mean(axis=0) + x[p:].mean(axis=0) + log_s + FIT.pull / 2 * (x**2).sum(axis=0)
+    gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
+    return cost, gradient + FIT.pull * x
 
 
-def _newton(smooth: _Smooth, x: AnyArray) -> AnyArray:
+def _newton(smoothed: Callable[[AnyArray], tuple[AnyArray, AnyArray]], x: AnyArray) -> AnyArray:
     """Take one Newton step, shortened where the cost does not fall; the Hessian from differences of the gradient."""
-    cost, gradient = smooth.cost(x)
+    cost, gradient = smoothed(x)
     ahead = (x + _STEP * unit[:, None] for unit in np.eye(len(x)))
-    hessian = np.stack([(smooth.cost(other)[1] - gradient).T / _STEP for other in ahead], axis=-1)
+    hessian = np.stack([(smoothed(other)[1] - gradient).T / _STEP for other in ahead], axis=-1)
     hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + FIT.pull / 1000 * np.eye(len(x))
     step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
     step *= np.minimum(1.0, 2 / np.maximum(np.abs(step).max(axis=0), TINY))
-    slope = (gradient * step).sum(axis=0)
-    best, length = x, np.ones(x.shape[1])
-    pending = np.ones(x.shape[1], bool)
-    while pending.any() and length.min() > 1e-4:
-        trial = x + length * step
-        better = pending & (smooth.cost(trial)[0] <= cost + length * slope / 10)
-        best = np.where(better, trial, best)
-        pending &= ~better
-        length = np.where(pending, length / 3, length)
-    return best
+    slope, length = (gradient * step).sum(axis=0), np.ones(x.shape[1])
+    while (rises := smoothed(x + length * step)[0] > cost + length * slope / 10).any() and length.min() > 1e-4:
+        length = np.where(rises, length / 3, length)
+    return x + np.where(rises, 0.0, length) * step

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import AnyArray, Flags, StateSpace, block_diagonal, frozen, gain
+from ...core import AnyArray, DataError, Flags, StateSpace, block_diagonal, frozen, gain
 from ...core.frequency import nyquist_hz
 from ...core.linalg import pieces
 from ..forms import Form, completion, evenly, residual
@@ -21,7 +21,7 @@ from ..settings import FIT, PROOF, SET
 from .cover import NEPER_DB, Cover, Weight, optimal_cover
 from .joint import JointProblem, fit_jointly, refit
 from .proof import Certificate, Descriptor, certify, invert, leaves_nothing, residual_system
-from .sections import bilinear_squared
+from .sections import Sections, bilinear_squared
 
 
 def fit_weight(
@@ -32,19 +32,28 @@ def fit_weight(
     The tolerance is the overbound at which a lower order of the entries is good enough.
     """
     fit = _Fit(residuals, freqs_hz, sample_period_s)
-    weight = fit.start(max_order, tolerance_db)
-    proof, ratio = fit.proven(weight)
-    for _ in range(FIT.rounds):
-        missed = fit.costly(weight)
+    cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
+    p, m = cover.left.shape[1], cover.right.shape[1]
+    if not fit.tight_hz.size:
+        if any(E.any() for _, E in residuals.pieces(fit.checked_hz)):
+            alike = f"units are alike at all {len(freqs_hz)} frequencies given, and differ elsewhere"
+            raise DataError(f"Weights: {alike}; give frequencies at which they differ.")
+        nothing = gain(np.zeros((p, p)), sample_period_s), gain(np.eye(m), sample_period_s)
+        return Weight(*nothing, (0,) * p, (0,) * m, 0.0, 0.0), cover
+    at, fitted = fit.start_hz(), None
+    for _ in range(FIT.rounds + 1):
+        problem, near = fit.problem(at)
+        fitted = refit(problem, fitted.sections) if fitted else fit_jointly(problem, near, max_order, tolerance_db)
+        weight = fit.weight(fitted.sections)
+        proof, ratio = fit.proven(weight)
+        missed = fit.costly(weight, fitted.excess_db)
         if proof.bound > FIT.deficit:
-            missed = np.concatenate([missed, fit.checked_hz[_peaks(ratio)], [proof.freq_hz]])
+            missed = np.concatenate([missed, fit.checked_hz[_peaks(ratio - 1)], [proof.freq_hz]])
         if not missed.size:
             break
-        weight = fit.again(missed)
-        proof, ratio = fit.proven(weight)
-    cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
+        at = np.union1d(at, missed)
     on_grid, left = float(ratio.max()), weight.left
-    lift = max(proof.bound, on_grid) * (1 + PROOF.rounding) or 1.0  # until the left weight touches from above
+    lift = max(proof.bound, on_grid) * (1 + PROOF.rounding)  # until the left weight touches from above
     left = replace(left, C=left.C * lift, D=left.D * lift)
     weight, some = replace(weight, left=left, method=proof.method), cover.left.min(axis=1) > 0
     excess = weight.magnitudes(freqs_hz).at(some).cost() - cover.at(some).cost()
@@ -54,68 +63,62 @@ def fit_weight(
 
 def checking_grid(freqs_hz: AnyArray, sample_period_s: float) -> AnyArray:
     """Return a dense grid from DC to Nyquist: a fit is free to bend wherever nothing is checked."""
-    inside, steps = freqs_hz[freqs_hz > 0], np.arange(PROOF.density) / PROOF.density
-    between = (inside[:-1, None] * (inside[1:] / inside[:-1])[:, None] ** steps).ravel()
-    dense = np.unique(np.concatenate([[0.0], between, freqs_hz, [nyquist_hz(sample_period_s)]]))
-    tau = bilinear_squared(dense, sample_period_s)
-    inside = tau[(tau > 0) & (tau < np.inf)]
-    inner = np.log10(inside) if inside.size else np.zeros(1)
-    low, high = inner.min() - PROOF.decades, inner.max() + PROOF.decades
-    logs = np.logspace(low, high, 1 + int(PROOF.a_decade * (high - low)))
-    return joined(dense, np.arctan(np.sqrt(logs)) / (np.pi * sample_period_s))
-
-
-def joined(freqs_hz: AnyArray, others_hz: AnyArray) -> AnyArray:
-    """Return both in increasing order, without those of the others that are nearly there, or nearly one."""
-    others = np.unique(others_hz)
-    others = others[np.diff(others, prepend=-1.0) > PROOF.rounding * others]
-    at = np.searchsorted(freqs_hz, others)
-    below, above = freqs_hz[np.maximum(at - 1, 0)], freqs_hz[np.minimum(at, len(freqs_hz) - 1)]
-    near = np.minimum(np.abs(others - below), np.abs(others - above))
-    return np.sort(np.concatenate([freqs_hz, others[near > PROOF.rounding * others]]))
+    rows = np.arange(len(freqs_hz))
+    between = np.interp(np.arange(PROOF.density * len(rows)) / PROOF.density, rows, freqs_hz)
+    tau = bilinear_squared(freqs_hz, sample_period_s)
+    logs = np.log10(tau[(tau > 0) & (tau < np.inf)])
+    low, high = logs.min(initial=0.0) - PROOF.decades, logs.max(initial=0.0) + PROOF.decades
+    everywhere = np.logspace(low, high, 1 + int(PROOF.a_decade * (high - low)))
+    ends = [0.0, nyquist_hz(sample_period_s)]
+    return np.unique(
+        np.concatenate([ends, freqs_hz, between, np.arctan(np.sqrt(everywhere)) / (np.pi * sample_period_s)])
+    )
 
 
 class _Fit:
-    """One fit, and again with frequencies that it missed."""
+    """Residuals on the grids of a fit and of its check, and their optimal cover."""
 
     def __init__(self, residuals: Residuals, freqs_hz: AnyArray, dt: float) -> None:
         self.residuals, self.dt, self.band = residuals, dt, freqs_hz[[0, -1]]
         grid = checking_grid(freqs_hz, dt)
-        modes = residuals.modes_hz(grid, dt)
-        self.checked_hz = joined(grid, modes)
-        self.freqs_hz = joined(freqs_hz, modes[self._inside(modes)])
-        self.known = residuals.at(self.freqs_hz)
+        modes = residuals.modes_hz(freqs_hz, dt)
+        self.checked_hz = np.union1d(grid, modes)
+        self.freqs_hz = np.union1d(freqs_hz, modes[self._inside(modes)])
         few = residuals.count * len(self.checked_hz) <= SET.retained
         self.checked = residuals.at(self.checked_hz) if few else None
-        self.optimal = optimal_cover(self.known)
+        self.optimal = optimal_cover(residuals.at(self.freqs_hz))
+        some = self.optimal.left.min(axis=1) > 0
+        self.tight_hz, self.tight = self.freqs_hz[some], self.optimal.at(some)
 
     def _inside(self, freqs_hz: AnyArray) -> Flags:
         return (freqs_hz >= self.band[0]) & (freqs_hz <= self.band[1])
 
-    def start(self, max_order: int, tolerance_db: float) -> Weight:
-        """Fit at evenly chosen frequencies, and at fewer beyond the band."""
-        dt, (p, m) = self.dt, self.known.shape[2:]
-        if not self.known.any():
-            return Weight(gain(np.zeros((p, p)), dt), gain(np.eye(m), dt), (0,) * p, (0,) * m)
+    def start_hz(self) -> AnyArray:
+        """Return evenly chosen frequencies, and fewer beyond the band."""
         even = self.freqs_hz[evenly(len(self.freqs_hz), FIT.points)]
-        self.problem, near = self._problem(
-            np.sort(np.append(even, self.checked_hz[~self._inside(self.checked_hz)][::4]))
-        )
-        self.fitted = fit_jointly(self.problem, near, max_order, tolerance_db)
-        return self._weight()
+        return np.union1d(even, self.checked_hz[~self._inside(self.checked_hz)][::4])
 
-    def costly(self, weight: Weight) -> AnyArray:
+    def problem(self, freqs_hz: AnyArray) -> tuple[JointProblem, Cover]:
+        """Return the largest residuals by the optimal cover, with its cost within the band, and the cover."""
+        E = self.residuals.at(freqs_hz)
+        some = E.any(axis=(0, 2, 3))
+        E, freqs = E[:, some], freqs_hz[some]
+        cover = self.tight.at(np.searchsorted(self.tight_hz, freqs).clip(max=len(self.tight_hz) - 1))
+        leading = np.argsort(-cover.ratio(E), axis=0)[: FIT.units]
+        cost = np.interp(freqs, self.tight_hz, self.tight.cost())
+        optimal = np.where(self._inside(freqs), cost, np.inf)
+        tau = bilinear_squared(freqs, self.dt)
+        return JointProblem(tau, optimal, E[leading, np.arange(len(freqs))]), cover
+
+    def weight(self, sections: Sections) -> Weight:
+        """Return the systems of magnitudes, left ones first."""
+        systems, orders, p = sections.systems(self.dt), tuple(sections.orders.tolist()), self.tight.left.shape[1]
+        return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:])
+
+    def costly(self, weight: Weight, excess_db: float) -> AnyArray:
         """Return the frequencies between those of the fit, Hz, at which the weight costs more than at them."""
-        if not weight.left.D.any():
-            return np.zeros(0)
-        cost = NEPER_DB * (weight.magnitudes(self.freqs_hz).cost() - self.optimal.cost()) - self.fitted.excess_db
-        return self.freqs_hz[_peaks(10 ** ((np.nan_to_num(cost, posinf=0.0) - FIT.missed_db) / 20))]
-
-    def again(self, missed_hz: AnyArray) -> Weight:
-        """Fit again, with the largest residuals at further frequencies."""
-        self.problem = self.problem.joined(self._problem(np.unique(missed_hz))[0])
-        self.fitted = refit(self.problem, self.fitted.sections)
-        return self._weight()
+        cost = NEPER_DB * (weight.magnitudes(self.tight_hz).cost() - self.tight.cost())
+        return self.tight_hz[_peaks(cost - excess_db - FIT.missed_db)]
 
     def proven(self, weight: Weight) -> tuple[Certificate, AnyArray]:
         """Certify a weight for all units; return its largest ratios on the checked grid, too."""
@@ -125,32 +128,16 @@ class _Fit:
 
         E = self.checked
         known = ratio(self.checked_hz) if E is None else weight.magnitudes(self.checked_hz).ratio(E)
-        pencils = self.residuals.ratios(weight.left, weight.right) if known.max() > 0 else []
-        return certify(ratio, self.checked_hz, known, pencils, weight.left.dt), known.max(axis=0)
-
-    def _weight(self) -> Weight:
-        sections, p = self.fitted.sections, self.known.shape[2]
-        systems, orders = sections.systems(self.dt), tuple(sections.orders.tolist())
-        return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:])
-
-    def _problem(self, freqs_hz: AnyArray) -> tuple[JointProblem, Cover]:
-        """Return the largest residuals by the optimal cover, with its cost within the band, and the cover."""
-        best, E = self.optimal, self.residuals.at(freqs_hz)
-        known = np.flatnonzero(best.left.min(axis=1) > 0)
-        cover = best.at(known[np.searchsorted(self.freqs_hz[known], freqs_hz).clip(0, len(known) - 1)])
-        leading = np.argsort(-cover.ratio(E), axis=0)[: FIT.units]
-        some = np.flatnonzero(np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0)
-        cost = np.interp(freqs_hz, self.freqs_hz[known], best.at(known).cost())
-        optimal = np.where(self._inside(freqs_hz), cost, np.inf)
-        tau = bilinear_squared(freqs_hz, self.dt)
-        return JointProblem.of(tau[some], optimal[some], E[leading[:, some], some]), cover.at(some)
+        pencils = self.residuals.ratios(weight.left, weight.right)
+        return certify(ratio, self.checked_hz, known, pencils, self.dt), known.max(axis=0)
 
 
-def _peaks(ratio: AnyArray) -> AnyArray:
-    """Return the indices of the worst local maxima above one."""
-    inner = np.concatenate([[-np.inf], ratio, [-np.inf]])
-    tops = np.flatnonzero((ratio >= inner[:-2]) & (ratio >= inner[2:]) & (ratio > 1))
-    return np.sort(tops[np.argsort(-ratio[tops])[: PROOF.worst]])
+def _peaks(excess: AnyArray) -> AnyArray:
+    """Return the indices of the worst local maxima above zero."""
+    from scipy.signal import find_peaks
+
+    tops = find_peaks(np.pad(excess, 1, constant_values=-np.inf), height=0.0)[0] - 1
+    return tops[np.argsort(-excess[tops])[: PROOF.worst]]
 
 
 @frozen
@@ -206,16 +193,17 @@ class Residuals:
         parts = [after @ part @ before for part in systems]
         return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= PROOF.rows else []
 
-    def modes_hz(self, grid_hz: AnyArray, dt: float) -> AnyArray:
-        """Return frequencies of modes of residuals and plants that a grid from DC to Nyquist passes over."""
+    def modes_hz(self, freqs_hz: AnyArray, dt: float) -> AnyArray:
+        """Return frequencies of modes of residuals and plants, and a half-width beside them, that a grid passes over."""
+        grid = np.unique(np.concatenate([[0.0], freqs_hz, [nyquist_hz(dt)]]))
         parts = (*self._systems(remainder=False), *self._plants())
         modes = np.concatenate([np.zeros(0, complex), *(part.poles() for part in parts)])
         omega = modes.imag[modes.imag > 0]
         half = np.abs(modes.real[modes.imag > 0])
         at_hz, width_hz = np.arctan(omega) / (np.pi * dt), half / (1 + omega**2) / (np.pi * dt)
-        narrow = (width_hz < np.interp(at_hz, grid_hz, np.gradient(grid_hz))) & (at_hz <= grid_hz[-1])
+        narrow = width_hz < np.interp(at_hz, grid, np.gradient(grid))
         around = omega[narrow] + half[narrow] * np.array([[-1.0], [0.0], [1.0]])
-        return np.unique(np.arctan(around[around > 0]) / (np.pi * dt)).clip(max=grid_hz[-1])
+        return np.unique(np.arctan(around[around > 0]) / (np.pi * dt))
 
     def _plants(self) -> list[Descriptor]:
         """Return the nominal and the units where they are systems."""

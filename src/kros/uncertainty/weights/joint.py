@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from itertools import islice
 
 import numpy as np
 
@@ -37,19 +36,7 @@ class JointProblem:
 
     tau: AnyArray  # (frequency,)
     optimal: AnyArray  # (frequency,), nepers: mean log left plus mean log right; infinite where nothing has to be tight
-    residuals: AnyArray  # (n, p', m'), complex
-    at: AnyArray  # (n,): the frequency of each
-
-    @classmethod
-    def of(cls, tau: AnyArray, optimal: AnyArray, E: AnyArray) -> JointProblem:
-        """Return the problem of residuals (unit, frequency, p', m')."""
-        return cls(tau, optimal, E.reshape(-1, *E.shape[2:]), np.tile(np.arange(len(tau)), len(E)))
-
-    def joined(self, other: JointProblem) -> JointProblem:
-        """Return both."""
-        tau, optimal = np.append(self.tau, other.tau), np.append(self.optimal, other.optimal)
-        residuals = np.concatenate([self.residuals, other.residuals])
-        return JointProblem(tau, optimal, residuals, np.append(self.at, other.at + len(self.tau)))
+    residuals: AnyArray  # (unit, frequency, p', m'), complex
 
     @cached_property
     def ends(self) -> tuple[float, float]:
@@ -62,20 +49,12 @@ class JointProblem:
 def fit_jointly(problem: JointProblem, cover: Cover, max_order: int, tolerance_db: float) -> Bound:
     """Return diagonal magnitudes, left ones first, of the smallest order within the tolerance, or of the largest."""
     sides = np.hstack([cover.left, cover.right]).T
-    entries = [(rising_bounds(problem.tau, values, max_order), list[Bound]()) for values in sides]
-    for _ in range(max_order + 1):
-        for bounds, known in entries:
-            known += islice(bounds, 1)
-        fitted = refit(problem, Sections.stacked([_simplest(known, tolerance_db) for _, known in entries]))
+    enough = tolerance_db / 2  # of each side: together they are within the tolerance
+    for bounds in zip(*(rising_bounds(problem.tau, values, max_order, enough) for values in sides), strict=True):
+        fitted = refit(problem, Sections.stacked([bound.sections for bound in bounds]))
         if fitted.excess_db <= tolerance_db:
             break
     return fitted
-
-
-def _simplest(known: list[Bound], tolerance_db: float) -> Sections:
-    """Return the fit of the lowest order that is good enough, or as good as the best one but for a tenth."""
-    enough = max(tolerance_db / 2, known[-1].excess_db + tolerance_db / 10)
-    return next(bound.sections for bound in known if bound.excess_db <= enough)
 
 
 def refit(problem: JointProblem, start: Sections) -> Bound:
@@ -94,12 +73,11 @@ def refit(problem: JointProblem, start: Sections) -> Bound:
 
 @frozen
 class _Terms:
-    """Terms under one smoothed maximum: values, frequencies, and how much every entry moves each."""
+    """Terms under one smoothed maximum, and how much every entry moves each."""
 
-    values: AnyArray  # (n,)
-    at: AnyArray  # (n,)
-    shares: AnyArray  # (n, entry)
     price: float
+    values: AnyArray  # (n, frequency)
+    shares: AnyArray  # (entry, n, frequency)
 
     def smoothed(self, temperature: float) -> tuple[float, AnyArray]:
         """Return the smoothed maximum, and its derivative by every value."""
@@ -119,21 +97,19 @@ class _State:
     @cached_property
     def terms(self) -> tuple[_Terms, ...]:
         """Cost, soundness, and the peak of square weights."""
-        problem, (p, m) = self.problem, self.problem.residuals.shape[1:]
-        logs, count = self.sections.logs(problem.tau), len(problem.tau)
+        E, logs = self.problem.residuals, self.sections.logs(self.problem.tau)
+        p, m = E.shape[2:]
         left, right = logs[:p], logs[p:]
-        scaled = problem.residuals * np.exp(-left.T[problem.at][:, :, None] - right.T[problem.at][:, None])
-        sigma, shares = _singular(scaled)
-        excess = left.mean(axis=0) + right.mean(axis=0) - problem.optimal
-        inside = np.flatnonzero(np.isfinite(excess))
-        mean = np.broadcast_to(np.repeat([1 / p, 1 / m], [p, m]), (len(inside), p + m))
+        sound, shares = _singular(E * np.exp(-left.T[:, :, None] - right.T[:, None]))
+        mean = np.repeat([1 / p, 1 / m], [p, m])
         price = FIT.peak_price if p == m else 0.0
-        cost = _Terms(excess[inside], inside, mean, 1.0)
-        sound = _Terms(sigma.ravel(), np.repeat(problem.at, sigma.shape[1]), -shares.reshape(-1, p + m), 1.0 + price)
+        terms = (
+            _Terms(1.0, (mean @ logs - self.problem.optimal)[None], mean[:, None, None]),
+            _Terms(1.0 + price, sound, -shares),
+        )
         if not price:
-            return cost, sound
-        both = np.repeat(np.tile(np.eye(p), 2), count, axis=0)
-        return cost, sound, _Terms((left + right).ravel(), np.tile(np.arange(count), p), both, price)
+            return terms
+        return *terms, _Terms(price, left + right, np.tile(np.eye(p), (2, 1))[..., None])
 
     def value(self, temperature: float) -> float:
         """Return what is minimised, nepers."""
@@ -146,7 +122,8 @@ class _State:
         gradient = FIT.pull * (self.sections.parameters - self.start)
         spread, slopes = FIT.pull * np.eye(len(self.start)), self.sections.slopes(self.problem.tau)
         for terms in self.terms:
-            rows, weight = terms.shares[:, self.sections.owner].T * slopes[:, terms.at], terms.smoothed(temperature)[1]
+            weight = terms.smoothed(temperature)[1].ravel()
+            rows = (terms.shares[self.sections.owner] * slopes[:, None]).reshape(len(slopes), -1)
             mean = rows @ weight
             gradient += terms.price * mean
             spread += terms.price / temperature * ((rows * weight) @ rows.T - np.outer(mean, mean))
@@ -167,15 +144,16 @@ class _State:
     def fitted(self) -> Bound:
         """Return the sections, raised to be sound, and the largest excess of their cost."""
         excess, deficit = (float(terms.values.max()) for terms in self.terms[:2])
-        lifted = self.sections.lifted(slice(0, self.problem.residuals.shape[1]), deficit)
-        return Bound(lifted, (excess + deficit) * NEPER_DB)
+        level = self.sections.level + deficit * (np.arange(len(self.sections.level)) < self.problem.residuals.shape[2])
+        return Bound(replace(self.sections, level=level), (excess + deficit) * NEPER_DB)
 
 
 def _singular(matrices: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Return log singular values, (n, rank), and squared moduli of the entries of their vectors, left then right."""
-    other, wide = adjoint(matrices), matrices.shape[1] <= matrices.shape[2]
-    squares, short = np.linalg.eigh(matrices @ other if wide else other @ matrices)
-    long = np.abs((other if wide else matrices) @ short) ** 2
-    long /= np.maximum(long.sum(axis=1, keepdims=True), TINY)
-    parts = (np.abs(short) ** 2, long) if wide else (long, np.abs(short) ** 2)
-    return np.log(np.maximum(squares, TINY)) / 2, np.swapaxes(np.concatenate(parts, axis=1), 1, 2)
+    """Return log singular values of (unit, frequency, p, m) and squared moduli of their vectors, entries first."""
+    squares, right = np.linalg.eigh(adjoint(matrices) @ matrices)
+    left = np.abs(matrices @ right) ** 2
+    left /= np.maximum(left.sum(axis=-2, keepdims=True), TINY)
+    shares = np.moveaxis(np.concatenate([left, np.abs(right) ** 2], axis=-2), (-2, -1), (0, 1))
+    count, n_freqs = len(matrices) * matrices.shape[-1], matrices.shape[1]
+    logs = np.log(np.maximum(np.moveaxis(squares, -1, 0), TINY)) / 2
+    return logs.reshape(count, n_freqs), shares.reshape(-1, count, n_freqs)

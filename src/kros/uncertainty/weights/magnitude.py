@@ -21,8 +21,7 @@ Squared magnitudes are rational in tau:
 `phi_k` is the power `tau^k` over the common denominator `prod (tau + tau_j)`, of size one between two knots and small
 elsewhere: real poles and zeros give positive coefficients, and nothing cancels over any number of decades. With
 `w = (z - 1) / (z + 1)`, `w^2 = -tau` on the unit circle: a root `t` off the half-line `[0, inf)` gives the zero or pole
-`w = -sqrt(-t)` in the open left half-plane, inside the unit circle of `z`. Roots come from arithmetic of 30 digits,
-because they spread over twice as many decades as the frequencies.
+`w = -sqrt(-t)` in the open left half-plane, inside the unit circle of `z`.
 
 References
 ----------
@@ -32,10 +31,9 @@ C. L. Lawson and R. J. Hanson, "Solving Least Squares Problems", Prentice-Hall (
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain, pairwise
 
 import numpy as np
 
@@ -105,8 +103,6 @@ def fit_magnitude(
         Magnitudes negative, NaN or infinite.
     ConfigError
         A negative order, or frequencies that are no grid.
-    KrosError
-        When no program of any order could be solved.
 
     Examples
     --------
@@ -118,8 +114,7 @@ def fit_magnitude(
     >>> bool(np.all(gain_at_freqs >= 1 / np.hypot(1.0, freqs / 3.0) + 0.01))
     True
     """
-    freqs, dt, best = check_grid(freqs_hz, sample_period_s), sample_period_s, None
-    values = np.asarray(magnitude, float)
+    freqs, values = check_grid(freqs_hz, sample_period_s), np.asarray(magnitude, float)
     if values.shape != freqs.shape:
         raise DimensionError(f"Magnitude fit: needs one at each of {len(freqs)} frequencies, found {values.shape}.")
     valid = np.isfinite(values) & (values >= 0)
@@ -127,19 +122,17 @@ def fit_magnitude(
         where = int(np.argmin(valid))
         problem = "Magnitude fit: magnitudes should be finite and not negative"
         raise DataError(f"{problem}, found {values[where]} at {freqs[where]} Hz; look at the responses.")
-    values = np.maximum(values, MAGNITUDE.floor * values.max())
     if max_order < 0:
         raise ConfigError(f"Magnitude fit: max_order should not be negative, found {max_order}.")
     if not values.any():
-        return FittedMagnitude(gain([[0.0]], dt), 0.0)
-    for bound in rising_bounds(bilinear_squared(freqs, dt), values, max_order):
-        fitted = _touching(bound, freqs, values, dt)
-        best = fitted if best is None or fitted.overbound_db < best.overbound_db else best
-        if best.overbound_db <= tolerance_db:
-            break
-    if best is None:
-        raise KrosError("Magnitude fit: no program of any order was solved; look at the magnitudes.")
-    return best
+        return FittedMagnitude(gain([[0.0]], sample_period_s), 0.0)
+    values = np.maximum(values, MAGNITUDE.floor * values.max())
+    *_, bound = rising_bounds(bilinear_squared(freqs, sample_period_s), values, max_order, tolerance_db)
+    (system,) = bound.sections.systems(sample_period_s)
+    ratio = np.abs(system.frequency_response(freqs)[:, 0, 0]) / values
+    touch = (1 + 4 * EPS) / ratio.min()
+    touching = replace(system, C=system.C * touch, D=system.D * touch)
+    return FittedMagnitude(touching, float(20 * np.log10(ratio.max() / ratio.min())))
 
 
 @frozen
@@ -150,120 +143,84 @@ class Bound:
     excess_db: float
 
 
-def rising_bounds(tau: AnyArray, magnitude: AnyArray, max_order: int) -> Iterator[Bound]:
-    """Yield the tightest bounds of positive magnitudes at increasing tau, order by order, or a better lower one."""
+def rising_bounds(tau: AnyArray, magnitude: AnyArray, max_order: int, enough_db: float) -> Iterator[Bound]:
+    """Yield the tightest bounds of positive magnitudes at increasing tau, by order, or a lower one that is enough.
+
+    Further poles and zeros would all but cancel, wherever rounding has them.
+    """
     values = np.maximum(magnitude, MAGNITUDE.floor * magnitude.max())
-    unit = float(np.exp(np.mean(np.log(values))))
-    targets = (values / unit) ** 2
-    best, ratio, bound = RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), np.inf, None
+    unit = np.log(values).mean()
+    targets = (values / np.exp(unit)) ** 2
+    top, none = targets.max(), np.zeros(0)
+    bound = Bound(Sections.of_roots(np.log(top) / 2, none, none), 10 * float(np.log10(top / targets.min())))
     for order in range(max_order + 1):
-        better = best if not order else _best(tau, targets, order, ratio)
-        if better is not None:
-            best, ratio = better, float((better(tau) / targets).max())
-            try:
-                sections = best.factor().lifted(slice(0, 1), float(np.log(unit)))
-                bound = Bound(sections, 10 * float(np.log10(ratio)))
-            except KrosError:  # roots that do not settle, or too near the unit circle
-                pass
-        if bound is not None:
-            yield bound
-        if ratio < MAGNITUDE.exact:
-            break
+        if order and bound.excess_db > max(enough_db, MAGNITUDE.exact_db):
+            bound = _better(tau, targets, order, bound)
+        yield replace(bound, sections=replace(bound.sections, level=bound.sections.level + unit))
 
 
-def _touching(bound: Bound, freqs: AnyArray, values: AnyArray, dt: float) -> FittedMagnitude:
-    """Return the system of a bound, scaled until it touches the values as evaluated."""
-    (system,) = bound.sections.systems(dt)
-    ratio = np.abs(system.frequency_response(freqs)[:, 0, 0]) / values
-    touch = (1 + 4 * EPS) / ratio.min()
-    lifted = replace(system, C=system.C * touch, D=system.D * touch)
-    return FittedMagnitude(lifted, float(20 * np.log10(ratio.max() / ratio.min())))
-
-
-def _best(tau: AnyArray, targets: AnyArray, order: int, gamma: float) -> RationalMagnitude | None:
-    """Return the best n / d of one order above the targets, positive on the whole axis, of a ratio below gamma."""
+def _better(tau: AnyArray, targets: AnyArray, order: int, known: Bound) -> Bound:
+    """Return the bound by the best n / d of one order, positive on the whole axis, or the known one if that is none."""
     knots, cuts = np.exp(_bends(tau, np.log(targets), order)), np.zeros(0)
     for _ in range(MAGNITUDE.rounds):
-        best = _Grid.of(tau, targets, knots, cuts).best(gamma)
+        best, ratio = _dinkelbach(tau, targets, knots, cuts, 10 ** (known.excess_db / 10))
+        if best is None:
+            break
         try:
-            zeros = best.not_positive() if best is not None else []
-        except KrosError:  # multiple roots
-            return None
-        if not zeros:
-            return best
-        cuts = np.unique(np.concatenate([cuts, zeros, [np.sqrt(x * y) for x, y in pairwise(zeros)]]))
-    return None
+            zeros = best.not_positive()
+            if not zeros.size:
+                return Bound(best.factor(), 10 * float(np.log10(ratio)))
+        except KrosError:  # roots at zero, at infinity or too near the unit circle
+            break
+        cuts = np.unique(np.concatenate([cuts, zeros, np.sqrt(zeros[1:] * zeros[:-1])]))
+    return known
 
 
 def _bends(tau: AnyArray, log: AnyArray, count: int) -> AnyArray:
     """Return log tau, shape (count,), half as dense as log magnitudes bend over log tau, half evenly spaced."""
     inside = (tau > 0) & (tau < MAGNITUDE.highest)
-    if inside.sum() < 3:
-        return np.linspace(-MAGNITUDE.highest, 0.0, count + 2)[1:-1]
-    x = np.log(tau[inside])
-    middle = (x[1:] + x[:-1]) / 2
-    bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.diff(log[inside]) / np.diff(x))))])
-    share = bend / max(bend[-1], TINY) + (middle - middle[0]) / (middle[-1] - middle[0])
-    return np.interp((np.arange(count) + 0.5) / count * share[-1], share, middle)
+    x, y = (np.log(tau[inside]), log[inside]) if inside.any() else np.zeros((2, 1))
+    even = np.linspace(x[0], x[-1], len(x) + 2)
+    bend = np.cumsum(np.abs(np.diff(np.interp(even, x, y), 2)))
+    share = bend / max(bend[-1], TINY) + np.linspace(0.0, 1.0, len(bend))
+    return np.interp((np.arange(count) + 0.5) / count * share[-1], share, even[1:-1])
 
 
-@frozen
-class _Grid:
-    """Squared magnitudes f to stay above, with the basis evaluated there."""
-
-    targets: AnyArray  # (n_points,)
-    knots: AnyArray  # (order,)
-    phi: AnyArray  # (n_points, order + 1)
-    edge: AnyArray  # (n_edges, order + 1): rows that keep n and d from falling at DC, Nyquist and cuts
-    nearest: AnyArray  # (n_edges,): grid points next to these
-
-    @classmethod
-    def of(cls, tau: AnyArray, targets: AnyArray, knots: AnyArray, cuts: AnyArray) -> _Grid:
-        """Evaluate the basis on a grid."""
-        phi = basis(tau, knots)
-        nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
-        edge = MAGNITUDE.edge * phi[nearest] - basis(np.concatenate([[0.0], cuts, [np.inf]]), knots)
-        return cls(targets, knots, phi, edge, nearest)
-
-    def best(self, gamma: float) -> RationalMagnitude | None:
-        """Return the bound of the smallest ratio; None where none is below gamma."""
-        best, scale = None, self.targets**-0.5  # n and d share the slope
-        while (solution := self._solved(scale, gamma)) is not None:
-            n, d = self.phi @ solution[0], self.phi @ solution[1]
-            if not ((d > 0) & (n > 0)).all():
-                break
-            ratio = n / (self.targets * d)
-            spread = float(ratio.max() / ratio.min())
-            if spread >= gamma * MAGNITUDE.settled:
-                break
-            best = RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots)
-            gamma, scale = spread, d
-            if spread < MAGNITUDE.exact:
-                break
-        return best
-
-    def _solved(self, scale: AnyArray, gamma: float) -> tuple[AnyArray, AnyArray] | None:
-        """Return a and b, up to a factor, of the program's solution; None where it has none."""
-        from scipy.optimize import nnls
-
-        d = self.phi / scale[:, None]
-        n, none = d / self.targets[:, None], np.zeros_like(self.edge)
-        high, low = np.hstack([-n, gamma * d]), np.hstack([n, -d])
-        ends = np.block([[-self.edge / self.targets[self.nearest, None], none], [none, -self.edge]])
-        limits = np.repeat([len(n) ** -0.5, 0.0], [len(n), len(n) + len(ends)])
+def _dinkelbach(
+    tau: AnyArray, targets: AnyArray, knots: AnyArray, cuts: AnyArray, gamma: float
+) -> tuple[RationalMagnitude | None, float]:
+    """Return the bound of the smallest ratio below gamma, and that; n and d do not fall at DC, Nyquist and cuts."""
+    phi, edges = basis(tau, knots), np.concatenate([[0.0], cuts, [np.inf]])
+    edge = basis(edges, knots) - MAGNITUDE.edge * phi[np.searchsorted(tau, edges).clip(max=len(tau) - 1)]
+    best, scale = None, targets**-0.5  # n and d share the slope
+    while True:
         try:
-            R = qr_triangle(np.vstack([high, MAGNITUDE.below * low]))
-            rows = np.vstack([np.linalg.solve(R.T, np.vstack([high, low, ends]).T), limits])
-        except np.linalg.LinAlgError:  # a basis function that is zero on the grid
-            return None
-        if not np.isfinite(rows).all():
-            return None
-        try:
-            solution = rows[:-1] @ nnls(rows, np.eye(len(rows))[-1])[0]
-        except RuntimeError:  # not solved in as many steps as nnls takes: no better bound from this denominator
-            return None
-        a, b = np.split(np.linalg.solve(R, solution), 2)
-        return a, b
+            a, b = _program(phi / scale[:, None], targets, edge, gamma)
+        except (RuntimeError, np.linalg.LinAlgError):  # no solution in as many steps as nnls takes, or no unique one
+            return best, gamma
+        n, d = phi @ a, phi @ b
+        if not ((d > 0) & (n > 0)).all():
+            return best, gamma
+        ratio = n / (targets * d)
+        spread = float(ratio.max() / ratio.min())
+        if spread >= gamma * MAGNITUDE.settled:
+            return best, gamma
+        best, gamma, scale = RationalMagnitude(a / ratio.min(), b, knots), spread, d
+
+
+def _program(phi: AnyArray, targets: AnyArray, edge: AnyArray, gamma: float) -> list[AnyArray]:
+    """Return a and b, up to a factor, of the program's solution, phi divided by the denominator before."""
+    from scipy.linalg import block_diag
+    from scipy.optimize import nnls
+
+    n = phi / targets[:, None]
+    high, low = np.hstack([-n, gamma * phi]), np.hstack([n, -phi])
+    above = np.vstack([high, low, block_diag(edge, edge)])
+    limits = np.repeat([len(n) ** -0.5, 0.0], [len(n), len(above) - len(n)])
+    R = qr_triangle(np.vstack([high, MAGNITUDE.below * low]))
+    rows = np.vstack([np.linalg.solve(R.T, above.T), limits])
+    solution = rows[:-1] @ nnls(rows, np.eye(len(rows))[-1])[0]
+    return np.split(np.linalg.solve(R, solution), 2)
 
 
 _ROUNDING = 4096 * EPS
@@ -277,26 +234,23 @@ class RationalMagnitude:
     denominator: AnyArray  # (order + 1,): coefficients b
     knots: AnyArray  # (order,): the tau_k
 
-    def __call__(self, tau: ArrayLike) -> AnyArray:
-        """Return the squared magnitude, shape of `tau`; infinity (Nyquist) is allowed."""
-        phi = basis(np.asarray(tau, float), self.knots)
-        return (phi @ self.numerator) / (phi @ self.denominator)
-
     @cached_property
-    def sides(self) -> tuple[Sequence[complex], ...]:
+    def sides(self) -> tuple[AnyArray, AnyArray]:
         """Roots in tau of numerator and denominator."""
-        return tuple(roots(c, self.knots) for c in (self.numerator, self.denominator))
+        return roots(self.numerator, self.knots), roots(self.denominator, self.knots)
 
-    def not_positive(self) -> list[float]:
-        """Return the tau >= 0 at which numerator or denominator vanish."""
-        return sorted(r.real for r in chain(*self.sides) if r.real >= 0 and abs(r.imag) <= _ROUNDING * abs(r))
+    def not_positive(self) -> AnyArray:
+        """Return the tau >= 0 at which numerator or denominator vanish, in increasing order."""
+        every = np.concatenate(self.sides)
+        return np.sort(every.real[(every.real >= 0) & (np.abs(every.imag) <= _ROUNDING * np.abs(every))])
 
     def factor(self) -> Sections:
         """Return the stable, minimum-phase system of a positive squared magnitude, or raise a `KrosError`."""
-        zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in self.sides)
-        distance = np.array([1 - abs((1 + w) / (1 - w)) for w in (*zeros, *poles)])
-        if not (distance > _ROUNDING / 10).all():
-            problem = f"a pole or zero is {distance.min():.1e} from the unit circle, too near for double precision"
+        zeros, poles = (-np.sqrt(-side.astype(complex)) for side in self.sides)
+        every = np.concatenate([zeros, poles])
+        distance = 1 - np.abs((1 + every) / (1 - every)).max(initial=0.0)
+        if not distance > _ROUNDING / 10:
+            problem = f"a pole or zero is {distance:.1e} from the unit circle, too near for double precision"
             raise KrosError(f"Spectral factor: {problem}; try another order.")
         return Sections.of_roots(float(np.log(self.numerator[0] / self.denominator[0]) / 2), zeros, poles)
 
@@ -312,22 +266,10 @@ def basis(tau: AnyArray, knots: AnyArray) -> AnyArray:
     return rising * falling
 
 
-def roots(coefficients: AnyArray, knots: AnyArray) -> Sequence[complex]:
+def roots(coefficients: AnyArray, knots: AnyArray) -> AnyArray:
     """Return the roots in tau of `sum a_k phi_k`, whose first and last coefficients are not zero."""
-    import mpmath
-
-    order = len(knots)
     if not (np.isfinite(coefficients).all() and coefficients[0] and coefficients[-1]):
-        raise KrosError(f"Spectral factor: no {order} roots of coefficients {coefficients}; try another order.")
-    with mpmath.workdps(MAGNITUDE.digits):
-        unit = mpmath.mpf(float(np.exp(np.log(knots).mean()))) if order else mpmath.mpf(1)
-        powers, factor = [mpmath.mpf(0)] * (order + 1), mpmath.mpf(1)  # highest power first
-        for k in range(order, -1, -1):
-            powers[order - k] = mpmath.mpf(float(coefficients[k])) * factor
-            factor *= mpmath.mpf(float(knots[k - 1])) / unit if k else 1
-        try:
-            start = np.roots([float(c) for c in powers])
-            settled = mpmath.polyroots(powers, maxsteps=60, extraprec=200, roots_init=start.tolist())
-        except (mpmath.mp.NoConvergence, np.linalg.LinAlgError, ZeroDivisionError) as error:
-            raise KrosError(f"Spectral factor: roots of degree {order} did not settle; try another order.") from error
-        return [complex(r * unit) for r in settled]
+        raise KrosError(f"Spectral factor: no {len(knots)} roots of coefficients {coefficients}; try another order.")
+    unit = np.exp(np.log(knots).sum() / max(len(knots), 1))  # in the middle of the roots, which spread over decades
+    powers = coefficients * np.append(np.cumprod(knots[::-1] / unit)[::-1], 1.0)
+    return np.roots(powers[::-1]) * unit

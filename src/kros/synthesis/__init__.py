@@ -12,33 +12,13 @@ Examples
 0.5
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from ..core.lazy import lazy_names
-
-if TYPE_CHECKING:
-    from .generalized_plant import GeneralizedPlant
-    from .mixed_norms.mixed import mixed
-    from .problem.observer_problem import ObserverProblem
-    from .result import Injection, Status, Synthesis
-    from .riccati.h2 import h2, kalman
-    from .riccati.hinf import hinf
-    from .worst_case.worst_case_h2 import worst_case_h2
-
-_HOME = {
-    "GeneralizedPlant": "generalized_plant",
-    "Injection": "result",
-    "ObserverProblem": "problem.observer_problem",
-    "Status": "result",
-    "Synthesis": "result",
-    "h2": "riccati.h2",
-    "hinf": "riccati.hinf",
-    "kalman": "riccati.h2",
-    "mixed": "mixed_norms.mixed",
-    "worst_case_h2": "worst_case.worst_case_h2",
-}
+from .generalized_plant import GeneralizedPlant
+from .mixed_norms.mixed import mixed
+from .problem.observer_problem import ObserverProblem
+from .result import Injection, Status, Synthesis
+from .riccati.h2 import h2, kalman
+from .riccati.hinf import hinf
+from .worst_case.worst_case_h2 import worst_case_h2
 
 __all__ = [
     "GeneralizedPlant",
@@ -52,5 +32,3 @@ __all__ = [
     "mixed",
     "worst_case_h2",
 ]
-
-__getattr__, __dir__ = lazy_names(__name__, _HOME)

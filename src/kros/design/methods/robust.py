@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ... import synthesis  # solvers load when they are used
 from ...core import Record, StateSpace, frozen, gain
 from ...identify.model_set import EDMD
-from ...synthesis import Injection, ObserverProblem
+from ...synthesis import Injection, ObserverProblem, mixed, worst_case_h2
 from ...uncertainty import residual
 from ...uncertainty.unit_residuals import EntryWeights, fit_entries
 from ..task import Design, DesignTask, Label, Method
@@ -30,7 +29,7 @@ class Mixed(Method):
     def design(self, task: DesignTask) -> Design:
         """Solve the mixed problem."""
         problem = replace(task.require_problem(), injection=Injection.INPUT)
-        return task.designed(synthesis.mixed(problem, steps=self.steps))
+        return task.designed(mixed(problem, steps=self.steps))
 
 
 @frozen
@@ -44,7 +43,7 @@ class Published(Mixed):
     def design(self, task: DesignTask) -> Design:
         """Solve the published problem; its weights bound entries: its own norms are none of the set."""
         weights = self.weights(task)
-        solved = synthesis.mixed(as_published(task.require_problem(), weights.system), steps=self.steps)
+        solved = mixed(as_published(task.require_problem(), weights.system), steps=self.steps)
         note = f"The weights bound entries: a full perturbation exceeds them {weights.excess:.3g} times."
         nothing: Record = {"worst_case_h2": None, "quadrature_error": None}
         published = replace(solved, method=self.name, notes=(*solved.notes, note), **nothing)
@@ -77,4 +76,4 @@ class WorstCaseH2(Method):
     def design(self, task: DesignTask) -> Design:
         """Design it for the uncertain set."""
         problem, order = task.require_problem(), self.max_order
-        return task.designed(synthesis.worst_case_h2(problem, max_order=order, tolerance_db=self.tolerance_db))
+        return task.designed(worst_case_h2(problem, max_order=order, tolerance_db=self.tolerance_db))

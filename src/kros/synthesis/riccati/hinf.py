@@ -23,7 +23,6 @@ gamma : level;  K : controller
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import null_space
 
 from ...core import AGREED, EPS, ITERATED, AnyArray, ConfigError, KrosError, StateSpace, SynthesisError, frozen, gain
 from ...core.linalg import adjoint
@@ -142,6 +141,8 @@ _RANK = float(np.sqrt(EPS))  # relative: signals that are smaller prove nothing
 
 def frequency_bound(p: GeneralizedPlant) -> float:
     """Return the largest bound of the frequencies around all poles, refined around the largest some rounds."""
+    from scipy.linalg import null_space
+
     sides = (p.A, p.B1, p.C1, p.D11, p.C2, p.D21), (p.A.T, p.C1.T, p.B1.T, p.D11.T, p.B2.T, p.D12.T)
     best = 0.0
     for side in sides:

@@ -24,7 +24,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.linalg import LinAlgError, cond, eigh, eigvalsh, norm, svd
-from scipy.linalg import schur
 
 from ...core import EPS, SINGULAR, TINY, AnyArray, StateSpace, SynthesisError, frozen
 from ...core.linalg import balanced_size, spectral_radius
@@ -95,6 +94,8 @@ def _half(
     A: AnyArray, B1: AnyArray, B2: AnyArray, C: AnyArray, D1: AnyArray, D2: AnyArray, gamma: float
 ) -> tuple[AnyArray, AnyArray]:
     """Stabilising solution X of ``x' = A x + B1 w + B2 u``, cost ``z'z - gamma^2 w'w``, and its feedback of (w, u)."""
+    from scipy.linalg import schur
+
     n, B, D = len(A), np.hstack([B1, B2]), np.hstack([D1, D2])
     R = D.T @ D - gamma**2 * np.diag(np.arange(D.shape[1]) < D1.shape[1])
     solved = np.linalg.solve(R, np.hstack([D.T @ C, B.T]))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
-from ..core import Array, Columns, ConfigError, DataError, Parameters, Record, SynthesisError, frozen, grouped
+from ..core import TINY, Array, Columns, ConfigError, DataError, Parameters, Record, SynthesisError, frozen, grouped
 from ..data import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
@@ -142,21 +143,41 @@ def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> B
 
 
 @frozen
+class Motions:
+    """Motions that are known by their inputs, (n_samples, m) each."""
+
+    inputs: tuple[Array, ...]
+
+    @cached_property
+    def largest(self) -> Array:
+        """Largest absolute value of every input."""
+        return np.max([np.abs(motion).max(axis=0) for motion in self.inputs], axis=0)
+
+    def nearest(self, u: Array) -> tuple[int, float]:
+        """Return the motion of least RMS difference from inputs, a share of the largest of all, and that difference."""
+        sizes = np.maximum(self.largest, np.abs(u).max(axis=0))
+        both = ((u[: len(motion)], motion[: len(u)]) for motion in self.inputs)
+        squares = (np.mean((one - other) ** 2, axis=0) for one, other in both)
+        apart = [float((np.sqrt(square) / np.maximum(sizes, TINY)).max()) for square in squares]
+        return apart.index(min(apart)), min(apart)
+
+
+@frozen
 class MeanProfile:
-    """Mean states of motions that are known by their inputs, for machines that repeat a motion."""
+    """Mean states of motions, for machines that repeat a motion."""
 
     n_states: int
     estimated: Columns
-    inputs: Sequence[Array]  # (n_samples, m)
+    motions: Motions
     states: Sequence[Array]  # (n_samples, h)
 
     def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
         """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest."""
         del parameters
-        estimate, sizes = np.full((*y.shape[:2], self.n_states), np.nan), largest_of(self.inputs)
+        estimate = np.full((*y.shape[:2], self.n_states), np.nan)
         for i in range(y.shape[1]):
-            nearest = int(np.argmin([difference(u[:, i], motion, sizes) for motion in self.inputs]))
-            estimate[:, i, list(self.estimated)] = held(self.states[nearest], len(y))
+            states = self.states[self.motions.nearest(u[:, i])[0]]
+            estimate[:, i, list(self.estimated)] = held(states, len(y))
         return estimate
 
 
@@ -165,64 +186,49 @@ def held(signal: Array, n_samples: int) -> Array:
     return signal[np.minimum(np.arange(n_samples), len(signal) - 1)]
 
 
-def largest_of(inputs: Sequence[Array]) -> Array:
-    """Return the largest absolute value of every input over motions, one where it is always zero."""
-    largest = np.max([np.abs(motion).max(axis=0) for motion in inputs], axis=0)
-    return np.where(largest > 0, largest, 1.0)
-
-
-def difference(u: Array, motion: Array, sizes: Array) -> float:
-    """Return the RMS difference of inputs, shape (n_samples, m), as a share of `sizes`; the largest of all inputs."""
-    return float(np.sqrt(np.mean(((u - held(motion, len(u))) / sizes) ** 2, axis=0)).max())
-
-
 def make_mean_profile(
     training: TrainingSet, measured: Columns, population: Population, keys: Iterable[EpisodeKey]
 ) -> Baseline:
     """Average the states of training episodes that have the same motions, over units, and without each unit."""
-    n, same = len(population.states), DEFAULT.same_motion
+    n = len(population.states)
     estimated = tuple(i for i in range(n) if i not in measured)
     if not population.inputs or not estimated:
         raise DataError("Mean profile: it needs inputs that identify a motion, and a state that is not measured.")
-    motions = different_motions(population, keys, same)
-    means = unit_means(training, list(motions.values()), estimated, same)
-    for key, of_units in zip(motions, means, strict=True):
+    known = different_motions(population, keys)
+    motions = Motions(tuple(known.values()))
+    means = unit_means(training, motions, estimated)
+    for key, of_units in zip(known, means, strict=True):
         if len(of_units) < 2:
             raise DataError(
                 f"Mean profile: the inputs of held-out {key} do not occur in training episodes of two units; they may "
-                f"differ by {100 * same:g} % of the largest (RMS)."
+                f"differ by {100 * DEFAULT.same_motion:g} % of the largest (RMS)."
             )
 
     def without(left_out: str) -> MeanProfile:
         states = [np.mean([p for unit, p in of_units.items() if unit != left_out], axis=0) for of_units in means]
-        return MeanProfile(n, estimated, list(motions.values()), states)
+        return MeanProfile(n, estimated, motions, states)
 
-    by_unit = {unit: without(unit) for unit in (*dict.fromkeys(unit for one in means for unit in one), "")}
-    facts = {"status": "averaged", "motions": len(motions), "left_out": "the unit under test"}
+    by_unit = {unit: without(unit) for unit in {unit for of_units in means for unit in of_units} | {""}}
+    facts = {"status": "averaged", "motions": len(known), "left_out": "the unit under test"}
     return Baseline(by_unit, measured, estimated, facts, training.seen)
 
 
-def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:
+def different_motions(population: Population, keys: Iterable[EpisodeKey]) -> dict[EpisodeKey, Array]:
     """Return the inputs of episodes that differ, (n_samples, m) each."""
     motions = dict[EpisodeKey, Array]()
     for key in keys:
         u = population.read_parts(key)[1]
-        sizes = largest_of([*motions.values(), u])
-        if all(difference(u, motion, sizes) > same for motion in motions.values()):
+        if not motions or Motions(tuple(motions.values())).nearest(u)[1] > DEFAULT.same_motion:
             motions[key] = u
     return motions
 
 
-def unit_means(
-    training: TrainingSet, motions: Sequence[Array], estimated: Sequence[int], same: float
-) -> list[dict[str, Array]]:
+def unit_means(training: TrainingSet, motions: Motions, estimated: Columns) -> list[dict[str, Array]]:
     """Return the mean states of every motion by unit."""
-    sizes = largest_of(motions)
-    profiles: list[dict[str, list[Array]]] = [{} for _ in motions]
+    profiles: list[dict[str, list[Array]]] = [{} for _ in motions.inputs]
     for part in training.one_by_one():
-        apart = np.array([difference(motion, part.inputs[:, 0], sizes) for motion in motions])
-        at = int(apart.argmin())
-        if apart[at] <= same:
-            states = held(part.states[:, 0, list(estimated)], len(motions[at]))
+        at, apart = motions.nearest(part.inputs[:, 0])
+        if apart <= DEFAULT.same_motion:
+            states = held(part.states[:, 0, list(estimated)], len(motions.inputs[at]))
             profiles[at].setdefault(part.units[0], []).append(states)
     return [{unit: np.mean(some, axis=0) for unit, some in one.items()} for one in profiles]

@@ -137,11 +137,10 @@ class ObserverProblem:
             if getattr(self, name) is not None:
                 weight = StateSpace.of(getattr(self, name))
                 object.__setattr__(self, name, weight)
-                size = weight.n_outputs, weight.n_inputs
-                fits = size == (height or size[0], width or size[1]) and not weight.batch_shape
-                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {self.form.value}"
-                shape = f"{size[0]} x {size[1]}{weight.batch_shape or ''}"
-                self._require(fits, f"{wanted} uncertainty, found {shape}")
+                found = (*weight.batch_shape, weight.n_outputs, weight.n_inputs)
+                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {self.form.value} uncertainty"
+                fits = found == (height or found[0], width or found[-1])
+                self._require(fits, f"{wanted}, found {' x '.join(map(str, found))}")
                 self._require(weight.dt == dt, f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s")
 
     @classmethod

@@ -64,30 +64,24 @@ class Basis:
     # Of the lags, inside the unit circle, each one once: disturbances that last up to 300 samples
     poles: tuple[float, ...] = (0.9, 0.97, 0.99, 0.997)
 
-    @cached_property
-    def scalar(self) -> tuple[AnyArray, AnyArray]:
-        """Dynamics and input of the basis of one channel."""
-        from scipy.linalg import block_diag
-
-        shift = np.eye(self.delays, k=-1)
-        poles = np.array(self.poles)
-        b = np.concatenate([np.eye(self.delays, 1)[:, 0], np.sqrt(1 - poles**2)])
-        return block_diag(shift, np.diag(poles)), b
-
     @property
     def size(self) -> int:
         """States a channel."""
         return self.delays + len(self.poles)
 
-    def response(self, z: AnyArray) -> AnyArray:
-        """Return Z of one channel at points of the unit circle, shape (f, size)."""
-        lags = np.sqrt(1 - np.array(self.poles) ** 2) / (z[:, None] - np.array(self.poles))
-        return np.hstack([z[:, None] ** -np.arange(1, self.delays + 1), lags])
+    @cached_property
+    def scalar(self) -> StateSpace:
+        """The basis of one channel; its outputs are the states."""
+        from scipy.linalg import block_diag
+
+        poles = np.array(self.poles)
+        b = np.concatenate([np.eye(self.delays, 1)[:, 0], np.sqrt(1 - poles**2)])[:, None]
+        A = block_diag(np.eye(self.delays, k=-1), np.diag(poles))
+        return StateSpace(A, b, np.eye(self.size), np.zeros_like(b), 1.0)
 
     def system(self, n: int) -> tuple[AnyArray, AnyArray]:
         """Return A_z and B_z for n channels, the channels of one delay or lag side by side."""
-        A, b = self.scalar
-        return np.kron(A, np.eye(n)), np.kron(b[:, None], np.eye(n))
+        return np.kron(self.scalar.A, np.eye(n)), np.kron(self.scalar.B, np.eye(n))
 
 
 def circle_weights(f: int) -> AnyArray:
@@ -107,7 +101,7 @@ def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
         raise SynthesisError("Shaping filter: the residual is zero or not finite; correct nothing (open loop).")
     floor = _FLOOR * largest * np.eye(n)
     R, spectrum = R + floor, spectrum + floor
-    response = basis.response(np.exp(1j * np.linspace(0, np.pi, f)))
+    response = basis.scalar.frequency_response(np.linspace(0, 0.5, f))[..., 0]
     k = basis.size
     blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
     G = blocks.reshape(k * n, k * n)

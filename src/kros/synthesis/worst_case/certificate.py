@@ -61,14 +61,6 @@ def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, fl
 
 def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> tuple[float, float]:
     """Return what `certify` returns, for the error system from (d, r, n[, s]) and the mean of ``W_p e``."""
-    squared, error = _mean_square(problem, errors)
-    squared += float(np.sum(np.square(mean)))
-    upper = float(np.sqrt(squared + error))
-    return upper, upper - float(np.sqrt(squared))
-
-
-def _mean_square(problem: ObserverProblem, errors: StateSpace) -> tuple[float, float]:
-    """Return the mean of the density over all frequencies and the quadrature error."""
     problem.require_sound()
     if not errors.is_stable():
         radius = float(errors.spectral_radius())
@@ -77,13 +69,16 @@ def _mean_square(problem: ObserverProblem, errors: StateSpace) -> tuple[float, f
     systems = [errors, problem.W_L, problem.M, problem.N, problem.remainder_left, problem.remainder_right]
     poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
     poles = poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]
-    return circle_mean(lambda theta: density(problem, errors, theta / rate), np.log(poles), _ACCURACY)
+    squared, error = circle_mean(lambda theta: density(problem, errors, theta / rate), np.log(poles), _ACCURACY)
+    squared += float(np.sum(np.square(mean)))
+    upper = float(np.sqrt(squared + error))
+    return upper, upper - float(np.sqrt(squared))
 
 
 def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> Synthesis:
     """Return a controller in physical units with its certificate; ``h2_norm`` is that of the noise alone."""
-    value, error = certify(problem, controller)
     loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
+    value, error = certify_errors(problem, loop)
     return Synthesis(
         method=method,
         controller=controller,

@@ -35,9 +35,7 @@ class Uncertainty:
     nominals: dict[Form, str]  # unit behind each of these bounds
     cover: Cover  # optimal cover of the residuals, frequency by frequency
     weight: Weight
-    misfit: (
-        AnyArray  # (unit, frequency): what the form cannot rebuild, relative to the unit; NaN near singular inverses
-    )
+    misfit: AnyArray  # (unit, frequency): share of a unit that the form cannot rebuild; NaN near singular inverses
     remainder: Weight | None = None  # for `Gp - rebuilt(G, E)`, additive, where the form does not rebuild every unit
 
     @property

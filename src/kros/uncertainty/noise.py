@@ -61,12 +61,7 @@ def noise_share(
     for row in range(units):
         for part in blocks:
             drawn = models.responses(row, freqs_hz[part], sample_period_s) / scale  # (draw, frequency, n, m)
-            noise[part] += _mean_square(residual(form, drawn, np.roll(drawn, 1, axis=0))) / units
-    between = np.mean([_mean_square(residual(form, G[k], G)) for k in evenly(units, OUTLIER.nominals)], axis=0)
+            noise[part] += energy(residual(form, drawn, np.roll(drawn, 1, axis=0))).mean(axis=0) / units
+    between = np.mean([energy(residual(form, G[k], G)) for k in evenly(units, OUTLIER.nominals)], axis=(0, 1))
     largest = sigma_max(residual(form, G[nominal], G)).max(axis=0)
     return NoiseShare(freqs_hz, between * units / (units - 1), noise, largest)
-
-
-def _mean_square(E: AnyArray) -> AnyArray:
-    """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
-    return energy(E).mean(axis=0)

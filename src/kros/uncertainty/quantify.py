@@ -15,17 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core import (
-    ArrayLike,
-    ConfigError,
-    IdentificationError,
-    Work,
-    load_artifact,
-    loader,
-    read_json,
-    save_artifact,
-    write_json,
-)
+from ..core import ArrayLike, ConfigError, IdentificationError, Work
+from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
 from ..core.linalg import sigma_max
 from ..data import Shown
 from ..identify import ModelSet

@@ -100,9 +100,7 @@ class OutlierRule:
     nominals: int = 64  # at most, from which distances are measured
     smoothing: float = 1 / 3  # decades of the moving average
     balancings: int = 50  # of Sinkhorn's scaling
-    smallest: float = (
-        ROUNDING  # typical size of an entry, relative to its row and column; of equal responses' difference
-    )
+    smallest: float = ROUNDING  # typical size of an entry, relative to row and column; difference of equal responses
     least: float = 1e-10  # distance of responses that are the same, relative to the typical one
     at_once: int = 4_000_000  # complex numbers of residuals in memory
     fewest: int = 8  # units: with fewer the verdict stays open; of studies of five a third of good units were beyond

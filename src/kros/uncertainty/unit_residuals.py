@@ -12,6 +12,7 @@ weights and designs the paper's own observer with them; its sets have diagonal w
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -78,9 +79,8 @@ def fit_entries(
     """Return one magnitude for every entry of residuals (unit, frequency, p', m')."""
     p, m = E.shape[2:]
     sizes = np.abs(E).max(axis=0).reshape(len(freqs_hz), p * m).T
-    fits = [
-        fit_magnitude(freqs_hz, size, sample_period_s, max_order=max_order, tolerance_db=tolerance_db) for size in sizes
-    ]
+    fit = partial(fit_magnitude, max_order=max_order, tolerance_db=tolerance_db)
+    fits = [fit(freqs_hz, size, sample_period_s) for size in sizes]
     rows, columns = np.kron(np.eye(p), np.ones((1, m))), np.tile(np.eye(m), (p, 1))
     entries = block_diagonal([fit.system for fit in fits])
     system = gain(rows, sample_period_s) @ entries @ gain(columns, sample_period_s)

@@ -45,19 +45,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...core import (
-    AGREED,
-    TINY,
-    AnyArray,
-    ArrayLike,
-    DimensionError,
-    StateSpace,
-    SynthesisError,
-    frozen,
-    gain,
-    hinf_norm,
-    member,
-)
+from ...core import AGREED, TINY, AnyArray, DimensionError, StateSpace, SynthesisError, frozen, gain, hinf_norm, member
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
 from ..generalized_plant import GeneralizedPlant, interconnect
@@ -96,9 +84,7 @@ class ObserverProblem:
     input_scale: AnyArray  # (m,), physical size of each input
     output_scale: AnyArray  # (n,), physical size of each (lifted) state
     noise: AnyArray  # (q,), standard deviation of the white measurement noise per sample, in the units of y
-    n_original: int | None = (
-        None  # the first states are the original ones, whose errors over `output_scale` count; default all
-    )
+    n_original: int | None = None  # so many first states are the original ones, whose errors count; default all
     W_u: StateSpace | None = None  # (m, m), of the scaled inputs; default white inputs of unit variance
     remainder_left: StateSpace | None = None  # (n, n), left weight of the additive remainder on scaled states
     remainder_right: StateSpace | None = None  # (m, m), right weight of it on scaled inputs
@@ -144,7 +130,7 @@ class ObserverProblem:
                 self._require(weight.dt == dt, f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s")
 
     @classmethod
-    def from_uncertain(cls, models: ModelSet, uncertain: UncertainModel, noise: ArrayLike) -> ObserverProblem:
+    def from_uncertain(cls, models: ModelSet, uncertain: UncertainModel, noise: AnyArray) -> ObserverProblem:
         """Return the problem of the nominal unit and the set around it, remainder included.
 
         Parameters
@@ -152,7 +138,7 @@ class ObserverProblem:
         models : ModelSet
             The models that were quantified, in the recordings' units or divided by their ranges.
         uncertain : UncertainModel
-        noise : array_like, shape (q,)
+        noise : ndarray, shape (q,)
             Standard deviation of every measurement's noise, in the units of `models`.
 
         Raises
@@ -173,7 +159,7 @@ class ObserverProblem:
             W_R=uncertain.weight.right,
             input_scale=models.input_scale,
             output_scale=models.output_scale,
-            noise=np.asarray(noise, dtype=float),
+            noise=noise,
             n_original=models.lifting.n_states,
             remainder_left=getattr(remainder, "left", None),
             remainder_right=getattr(remainder, "right", None),

@@ -36,19 +36,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core import (
-    ITERATED,
-    ROUNDING,
-    TINY,
-    AnyArray,
-    Array,
-    Flags,
-    StateSpace,
-    SynthesisError,
-    block_diagonal,
-    frozen,
-    gain,
-)
+from ...core import ITERATED, ROUNDING, TINY, AnyArray, Flags, StateSpace, SynthesisError, block_diagonal, frozen, gain
 from ...core.norms import gramian, gramian_root, h2_norm
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.h2 import balancing, kalman, predictor_bound
@@ -122,11 +110,11 @@ def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
 class ResidualProblem:
     """Error dynamics, residuals of a population, and measurement noise."""
 
-    A: Array  # (n, n), error dynamics of the original states
-    C: Array  # (q, n), selects the measured states
+    A: AnyArray  # (n, n), error dynamics of the original states
+    C: AnyArray  # (q, n), selects the measured states
     spectra: AnyArray  # (unit, f, n, n), complex: cross spectral density of every unit's one-step residual
-    noise: Array  # (q,), standard deviation of the measurement noise
-    scale: Array  # (n,), range of every state; norms are of errors in these units
+    noise: AnyArray  # (q,), standard deviation of the measurement noise
+    scale: AnyArray  # (n,), range of every state; norms are of errors in these units
     dt: float  # s
     basis: Basis = field(default_factory=Basis)  # of the shaping filter
 
@@ -175,12 +163,12 @@ class ResidualProblem:
         measured = np.any(self.plant.C, axis=0)
         return ~measured | measured.all()
 
-    def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
+    def deviations(self, shaping: StateSpace, K: StateSpace) -> AnyArray:
         """Root mean square of every state's scaled error, (n,)."""
         loop = self.loop(shaping, K)
         return np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, loop.dt) @ loop.C.T), TINY))
 
-    def unit_errors(self, K: StateSpace) -> Array:
+    def unit_errors(self, K: StateSpace) -> AnyArray:
         """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
         f, n = self.spectra.shape[1:3]
         response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / K.dt, f))
@@ -241,7 +229,7 @@ def residual_h2(
     )
 
 
-def promised_errors(problem: ResidualProblem) -> Array:
+def promised_errors(problem: ResidualProblem) -> AnyArray:
     """Return the RMS error of every state, a share of its largest value, on the spectra as measured."""
     try:
         K = problem.correction(problem.filter())

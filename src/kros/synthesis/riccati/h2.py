@@ -34,22 +34,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.linalg import LinAlgError, cholesky, cond, eigh, eigvalsh, solve, svd
 
-from ...core import (
-    EPS,
-    ITERATED,
-    ROUNDING,
-    SINGULAR,
-    TINY,
-    AnyArray,
-    ArrayLike,
-    DimensionError,
-    StateSpace,
-    SynthesisError,
-    gain,
-    h2_norm,
-    hinf_norm,
-)
+from ...core import EPS, ITERATED, ROUNDING, SINGULAR, TINY, AnyArray, ArrayLike, DimensionError, SynthesisError
 from ...core.linalg import spectral_radius
+from ...core.lti import StateSpace, gain
+from ...core.norms import h2_norm, hinf_norm
 from ..assumptions import require, require_detectable
 from ..generalized_plant import GeneralizedPlant
 from ..result import Injection, Status, Synthesis

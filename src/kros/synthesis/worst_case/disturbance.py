@@ -49,8 +49,5 @@ def filters(power: AnyArray, freqs_hz: AnyArray, dt: float, max_order: int, tole
     """Return one filter a channel, whose magnitude touches the root of its power, shape (f, channels), from above."""
     largest = power.max(axis=0)
     power = np.where(largest > _NOTHING, np.maximum(power, _FLOOR * largest), 0.0)
-    fits = [
-        fit_magnitude(freqs_hz, column, dt, max_order=max_order, tolerance_db=tolerance_db)
-        for column in np.sqrt(power).T
-    ]
-    return block_diagonal([fit.system for fit in fits])
+    fit = partial(fit_magnitude, max_order=max_order, tolerance_db=tolerance_db)
+    return block_diagonal([fit(freqs_hz, column, dt).system for column in np.sqrt(power).T])

@@ -90,23 +90,19 @@ class OutlierModel(Storable):
         if len(rows) < 2:
             raise DataError(f"Scoring unit {unit}: {len(rows)} others are left, two are needed; record more units.")
         G = check_responses([*self.responses[:1], response], ("those scored", unit), self.freqs_hz)[1]
-        comparison = self._comparison(rows, G / self.output_scale[:, None] * self.input_scale)
-        beyond = margins(comparison.distances.levels, comparison.inliers, comparison.rate)[1][-1:]
+        G = G / self.output_scale[:, None] * self.input_scale
+        responses = self.responses[rows]
+        known = self._known if len(rows) == len(self.unit_ids) else distances(self.form, responses, self.freqs_hz)
+        found = known.joined(scaled_levels(self.form, responses[known.nominals], G, known, self.freqs_hz))
+        everyone, inliers = np.concatenate([responses, G[None]]), np.arange(len(rows) + 1) < len(rows)
+        comparison = Comparison(self.form, everyone, self.freqs_hz, found, inliers, self.false_alarm_rate)
+        beyond = margins(found.levels, inliers, self.false_alarm_rate)[1][-1:]
         (score,) = comparison.scores((unit,), self.threshold_db, beyond)
-        level = comparison.distances.levels[-1]
+        level = found.levels[-1]
         motion = 0.0 if motion_db is None else 10 ** (motion_db / 20)
         rest = np.maximum(10 ** (level / 20) - motion, OUTLIER.least)
         other = score.outlier and beyond[0] <= level.max() - 20 * np.log10(rest.max())
         return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if other else score
-
-    def _comparison(self, rows: AnyArray, response: AnyArray) -> Comparison:
-        """Return some inliers and one more unit, which comes last."""
-        responses = self.responses[rows]
-        known = self._known if len(rows) == len(self.unit_ids) else distances(self.form, responses, self.freqs_hz)
-        levels = scaled_levels(self.form, responses[known.nominals], response, known, self.freqs_hz)
-        inliers = np.arange(len(rows) + 1) < len(rows)
-        everyone = np.concatenate([responses, response[None]])
-        return Comparison(self.form, everyone, self.freqs_hz, known.joined(levels), inliers, self.false_alarm_rate)
 
     def motion_levels(self, one: AnyArray, other: AnyArray) -> AnyArray:
         """Return the level, shape (frequency,), dB, by which estimates differ where motions do.

@@ -37,20 +37,9 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core import (
-    EPS,
-    TINY,
-    AnyArray,
-    ArrayLike,
-    ConfigError,
-    DataError,
-    DimensionError,
-    KrosError,
-    StateSpace,
-    frozen,
-    gain,
-)
+from ...core import EPS, AnyArray, ArrayLike, ConfigError, DataError, DimensionError, KrosError, frozen
 from ...core.linalg import qr_triangle
+from ...core.lti import StateSpace, gain
 from ..forms import check_grid
 from ..settings import MAGNITUDE, WEIGHT
 from .sections import Sections, bilinear_squared
@@ -182,7 +171,7 @@ def _bends(tau: AnyArray, log: AnyArray, count: int) -> AnyArray:
     x, y = (np.log(tau[inside]), log[inside]) if inside.any() else np.zeros((2, 1))
     even = np.linspace(x[0], x[-1], len(x) + 2)
     bend = np.cumsum(np.abs(np.diff(np.interp(even, x, y), 2)))
-    share = bend / max(bend[-1], TINY) + np.linspace(0.0, 1.0, len(bend))
+    share = bend / (bend[-1] or 1.0) + np.linspace(0.0, 1.0, len(bend))
     return np.interp((np.arange(count) + 0.5) / count * share[-1], share, even[1:-1])
 
 

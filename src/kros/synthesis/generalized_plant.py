@@ -181,7 +181,7 @@ def split(system: StateSpace, n_w: int, n_z: int, **parts: int | None) -> Genera
     return GeneralizedPlant(system.A, B1, B2, C1, C2, D11, D12, D21, D22, system.dt, **parts)
 
 
-Sum = Mapping[str, AnyArray]
+Sum = Mapping[str, AnyArray | float]  # of sources, each with a matrix, or a multiple of the identity
 
 
 def interconnect(
@@ -192,7 +192,8 @@ def interconnect(
     sources = {name: block.n_outputs for name, block in blocks.items()}
     heights = {name: block.n_inputs for name, block in blocks.items()}
     F, H = _matrix(wires, heights, sources), _matrix(wires, heights, inputs)
-    tall = {name: next(iter(row.values())).shape[0] for name, row in outputs.items()}
+    sums = ((name, *source) for name, row in outputs.items() for source in row.items())
+    tall = {name: np.shape(value)[0] if np.ndim(value) else sources[source] for name, source, value in sums}
     P, Q = _matrix(outputs, tall, sources), _matrix(outputs, tall, inputs)
     loop = np.eye(len(F)) - F @ whole.D
     if len(F) and np.linalg.cond(loop) > SINGULAR:
@@ -206,9 +207,9 @@ def interconnect(
 
 def _matrix(rows: Mapping[str, Sum], heights: Mapping[str, int], widths: Mapping[str, int]) -> AnyArray:
     """Stack the matrices of all sums, zero where a sum does not name a source."""
-    return np.block(
-        [
-            [rows.get(name, {}).get(source, np.zeros((height, width))) for source, width in widths.items()]
-            for name, height in heights.items()
-        ]
-    )
+
+    def part(name: str, source: str) -> AnyArray:
+        value = rows.get(name, {}).get(source, 0.0)
+        return np.asarray(value) if np.ndim(value) else value * np.eye(heights[name], widths[source])
+
+    return np.block([[part(name, source) for source in widths] for name in heights])

@@ -87,8 +87,8 @@ def bound_systems(models: Any, form: Form, freqs_hz: ArrayLike | None, options: 
     grid = log_grid(system.dt, longest_s=getattr(models, "longest_s", None)) if freqs_hz is None else freqs_hz
     freqs = check_grid(grid, system.dt)
     fields = _bound(form, units, freqs, system.dt, ids, options)
-    nominal = system[fields["nominal"]]
-    return UncertainModel(nominal_system=nominal, output_scale=scales[0], input_scale=scales[1], **fields)
+    fields |= {"output_scale": scales[0], "input_scale": scales[1]}
+    return UncertainModel(nominal_system=system[fields["nominal"]], **fields)
 
 
 def bound_responses(

@@ -107,10 +107,7 @@ class ResidualH2(Method):
         problems = [ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
         lifted, order = given.lifting.n_lifted, self.max_order
         syntheses = [residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]
-        observers = [
-            task.observer(one, model.A, model.B) if model.refitted else task.observer(one)
-            for model, one in zip(models, syntheses, strict=True)
-        ]
+        observers = [task.observer(one, model.A, model.B) for model, one in zip(models, syntheses, strict=True)]
         best, error = task.best(observers)
         if not np.isfinite(error):
             raise SynthesisError("Residual-shaped observer: the nonlinear observer diverges on the training episodes.")

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...core import AnyArray, DimensionError, Record, StateSpace, SynthesisError, frozen, gain
+from ...core import DimensionError, Record, StateSpace, SynthesisError, frozen, gain
 from ...identify import ModelSet
 from ...lifting import Lifting
 from ...observer import delay_of
@@ -58,21 +58,23 @@ class LinearLoop:
     def around(self, G: StateSpace, perturbations: Sequence[tuple[StateSpace, StateSpace, Form]] = ()) -> Blocks:
         """Close the loop around a plant with weights of perturbations, left and right."""
         _, _, C, W_p = self.problem.scaled
-        eye, n, m = np.eye, G.n_outputs, G.n_inputs
-        blocks, u, x = {"G": G, "F": self.F, "K": self.K}, {"K": eye(m), "r": eye(m)}, {"G": eye(n)}
-        wires: dict[str, dict[str, AnyArray]] = {"G": dict(u), "K": {"F": eye(n)}}
+        n, m, blocks, u, x = G.n_outputs, G.n_inputs, {"G": G, "F": self.F, "K": self.K}, {"K": 1.0, "r": 1.0}, ["G"]
+        wires: Record = {"G": dict(u), "K": {"F": 1.0}}
         inputs, outputs, sizes = dict[str, int](), Record(), []
         for i, (left, right, form) in enumerate(perturbations):
-            L, R, acts = f"L{i}", f"R{i}", {f"L{i}": eye(left.n_outputs)}
+            L, R = f"L{i}", f"R{i}"
             blocks |= {L: left, R: right}
-            own = acts if form.inverse and form.at_input is form.sees_input else {}
-            wires |= {L: {f"w{i}": eye(left.n_inputs)}, R: (u if form.sees_input else {"G": eye(n)}) | own}
-            (wires["G"] if form.at_input else x).update(acts)
+            own = {L: 1.0} if form.inverse and form.at_input is form.sees_input else {}
+            wires |= {L: {f"w{i}": 1.0}, R: (u if form.sees_input else {"G": 1.0}) | own}
+            if form.at_input:
+                wires["G"][L] = 1.0
+            else:
+                x.append(L)
             sizes.append((left.n_inputs, right.n_outputs))
-            inputs[f"w{i}"], outputs[f"z{i}"] = left.n_inputs, {R: eye(right.n_outputs)}
-        truth, known = np.vstack([C, eye(n), np.zeros((m, n))]), eye(len(C) + n + m, m, -len(C) - n)
-        wires["F"] = {source: truth @ part for source, part in x.items()} | dict.fromkeys(u, known)
-        outputs["e"] = {source: W_p @ part for source, part in x.items()} | {"F": -W_p}
+            inputs[f"w{i}"], outputs[f"z{i}"] = left.n_inputs, {R: 1.0}
+        truth, known = np.vstack([C, np.eye(n), np.zeros((m, n))]), np.eye(len(C) + n + m, m, -len(C) - n)
+        wires["F"] = dict.fromkeys(x, truth) | dict.fromkeys(u, known)
+        outputs["e"] = dict.fromkeys(x, W_p) | {"F": -W_p}
         return Blocks(interconnect(blocks, wires, inputs | {"r": m}, outputs), [*sizes, (m, len(W_p))])
 
 

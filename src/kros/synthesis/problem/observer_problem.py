@@ -48,7 +48,7 @@ import numpy as np
 from ...core import AGREED, TINY, AnyArray, DimensionError, StateSpace, SynthesisError, frozen, gain, hinf_norm, member
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
-from ..generalized_plant import GeneralizedPlant, interconnect
+from ..generalized_plant import GeneralizedPlant, Sum, interconnect
 from ..result import Injection
 
 if TYPE_CHECKING:
@@ -277,7 +277,7 @@ class ObserverProblem:
         n, m, q, eye = len(A), B.shape[1], len(C), np.eye
         truth = np.vstack([C, eye(n), np.zeros((m, n))])
         columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
-        wires = {"plant": {"d": eye(m), "s": eye(m)}, "F": {"plant": truth, "r": truth} | columns}
+        wires: dict[str, Sum] = {"plant": {"d": 1.0, "s": 1.0}, "F": {"plant": truth, "r": truth} | columns}
         inputs, outputs = {"d": m, "r": n, "n": q, "s": m}, {"z": {"plant": W_p, "r": W_p, "F": -W_p}}
         blocks = {"plant": self.scaled_model, "F": self.scaled_estimate(estimate)}
         return interconnect(blocks, wires, inputs, outputs)
@@ -288,16 +288,14 @@ class ObserverProblem:
         return estimate.multiplied(1 / self.output_scale, sizes)
 
     @property
-    def _scales(self) -> tuple[AnyArray, AnyArray]:
-        """Sizes of the correction and of the measurements."""
-        return self.input_scale if self.injection is Injection.INPUT else self.output_scale, self.noise
+    def correction_scale(self) -> AnyArray:
+        """Physical size of each correction."""
+        return self.input_scale if self.injection is Injection.INPUT else self.output_scale
 
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
-        correction, noise = self._scales
-        return controller.multiplied(1 / correction, noise)
+        return controller.multiplied(1 / self.correction_scale, self.noise)
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
-        correction, noise = self._scales
-        return controller.multiplied(correction, 1 / noise)
+        return controller.multiplied(self.correction_scale, 1 / self.noise)

@@ -27,8 +27,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core import AnyArray, StateSpace, block_diagonal, gain
-from ..generalized_plant import GeneralizedPlant, interconnect, split
+from ...core import StateSpace, block_diagonal, gain
+from ..generalized_plant import GeneralizedPlant, Sum, interconnect, split
 from .observer_problem import ObserverProblem
 
 # In matrix inequalities: share of the measured channel's range, weight of the scaled correction.
@@ -42,16 +42,16 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     d, r, noise, u = np.split(eye(error.n_inputs), np.cumsum([m, n, q]), axis=1)
     z, y = np.split(eye(error.n_outputs), [n_z])
     blocks = {"error": error, "W_u": problem.input_weight, "W_L": problem.W_L, "W_R": problem.W_R}
-    inputs, acts = {"w1": m, "w2": problem.W_L.n_inputs, "n": q}, {"W_L": eye(problem.W_L.n_outputs)}
-    wires: dict[str, dict[str, AnyArray]] = {"W_u": {"w1": eye(m)}, "W_L": {"w2": eye(inputs["w2"])}}
+    inputs, acts = {"w1": m, "w2": problem.W_L.n_inputs, "n": q}, {"W_L": 1.0}
+    wires: dict[str, Sum] = {"W_u": {"w1": 1.0}, "W_L": {"w2": 1.0}}
     if not location.sees_input:
         blocks["plant"] = problem.scaled_model
-        wires["plant"] = {"W_u": eye(m)} | (acts if location.inverse and location.at_input else {})
-    seen = {"W_u": eye(m)} if location.sees_input else {"plant": eye(n)}
+        wires["plant"] = {"W_u": 1.0} | (acts if location.inverse and location.at_input else {})
+    seen = {"W_u" if location.sees_input else "plant": 1.0}
     wires["W_R"] = seen | (acts if location.inverse and location.at_input is location.sees_input else {})
     wires["error"] = {"W_L": d if location.at_input else r, "n": noise, "u": u}
-    outputs = {"z1": {"error": z}, "z2": {"W_R": eye(problem.W_R.n_outputs)}}
-    system = interconnect(blocks, wires, inputs | {"u": n_u}, outputs | {"y": {"error": y}})
+    outputs: dict[str, Sum] = {"z1": {"error": z}, "z2": {"W_R": 1.0}, "y": {"error": y}}
+    system = interconnect(blocks, wires, inputs | {"u": n_u}, outputs)
     return split(system, sum(inputs.values()), system.n_outputs - q)
 
 

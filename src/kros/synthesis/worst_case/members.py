@@ -44,12 +44,9 @@ def shifts(rows: int, columns: int) -> list[AnyArray]:
 
 def member(problem: ObserverProblem, delta: AnyArray) -> StateSpace:
     """Return ``W_L Delta (I - N Delta)^-1 M`` for a constant contraction."""
-    b, a = delta.shape
     blocks = {"M": problem.M, "N": problem.N, "Delta": gain(delta, problem.nominal.dt), "W_L": problem.W_L}
-    done, seen = {"Delta": np.eye(b)}, {"M": np.eye(a), "N": np.eye(a)}
-    wires = {"M": {"w1": np.eye(problem.M.n_inputs)}, "N": done, "Delta": seen, "W_L": done}
-    outputs = {"d": {"W_L": np.eye(problem.W_L.n_outputs)}}
-    return interconnect(blocks, wires, {"w1": problem.M.n_inputs}, outputs)
+    wires = {"M": {"w1": 1.0}, "N": {"Delta": 1.0}, "Delta": {"M": 1.0, "N": 1.0}, "W_L": {"Delta": 1.0}}
+    return interconnect(blocks, wires, {"w1": problem.M.n_inputs}, {"d": {"W_L": 1.0}})
 
 
 def mean(systems: Sequence[StateSpace]) -> StateSpace:

@@ -83,7 +83,7 @@ def main() -> None:
     )
     timed("learned estimator", lambda: every(lambda block: moments.estimator().run(block.y, block.u, block.phase)))
     estimates = 2 * sum(COUNTS) + 3
-    made = [run_observers([observer(LINEAR, 0)] * TOGETHER, block.y, block.u) for block in blocks]
+    made = [[*run_observers([observer(LINEAR, 0)] * TOGETHER, block.y, block.u)] for block in blocks]
     band = 40.0, 60.0
     summaries = partial(
         every,
@@ -94,7 +94,7 @@ def main() -> None:
     short, block = min(10_000, options.samples), blocks[0]
     timed(
         "20 candidates side by side, 32 episodes of 10 s",
-        lambda: run_observers([observer(KOOPMAN, 0)] * 20, block.y[:short], block.u[:short], block.phase),
+        lambda: [*run_observers([observer(KOOPMAN, 0)] * 20, block.y[:short], block.u[:short], block.phase)],
     )
     late = observer(KOOPMAN, 9, Runtime(delay=3, upper=np.array([9.0, 9.0, 9.0])))
     timed(
@@ -146,9 +146,9 @@ class Block:
         return (batch.take([i]) for i in range(len(keys)))
 
 
-def side_by_side(observers: list[Observer], block: Block) -> np.ndarray:
+def side_by_side(observers: list[Observer], block: Block) -> list[np.ndarray]:
     """Run observers of one model on some episodes."""
-    return run_observers(observers, block.y, block.u, block.of_lifting(observers[0].lifting))
+    return [*run_observers(observers, block.y, block.u, block.of_lifting(observers[0].lifting))]
 
 
 def load(observers: list[Observer], block: Block) -> None:

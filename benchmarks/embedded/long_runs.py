@@ -236,7 +236,7 @@ def least_input(observer: Observer) -> np.ndarray:
 def extended(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict) -> np.ndarray:
     """Return the estimates in extended precision, written out."""
     lifting, K, real = observer.lifting, observer.controller, np.longdouble
-    n, first = lifting.n_states, run_observers([observer], y[:2], u[:2], own)[0, 0]
+    n, first = lifting.n_states, next(run_observers([observer], y[:2], u[:2], own))[0]
     A, B, into, *linear = (
         np.asarray(M, dtype=real) for M in (observer.A[:n], observer.B[:n], observer.into[:n], K.A, K.B, K.C, K.D)
     )

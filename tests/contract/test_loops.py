@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
-from machines import LIMITS, MACHINES, drive, samples
+from machines import MACHINES, drive, samples
 
 from kros.core.errors import ConfigError
 from kros.export import export_fmu
@@ -21,7 +21,7 @@ from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 from kros.loops import compiler, library, recursion
 from kros.loops.compiler import find_compiler
-from kros.observer.simulate import run_innovations, run_observer, run_observers
+from kros.observer.simulate import run_innovations, run_observer
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
 MACHINE_COUNT = 37  # more than are side by side at once, and no multiple of a vector
@@ -80,13 +80,6 @@ def test_observers_of_all_kinds_run_alike(kind, lost, both):
         return run_observer(observer, y, u, own), nu, judged
 
     assert_same(*both(run))
-
-
-@needs_compiler
-def test_observers_side_by_side_run_alike(both):
-    y, u, phase = machines_of(lost=False)
-    observers = [drive(order=order, **LIMITS) for order in (0, 2, 5)]
-    assert_same(*both(lambda: run_observers(observers, y, u, {"phase": phase})))
 
 
 def model_of(lifting, units, rng):

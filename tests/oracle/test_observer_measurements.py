@@ -56,7 +56,7 @@ def test_gains_are_what_an_error_of_the_measurement_costs(sizes):
 
     def error(wrong):
         n = len(wrong)
-        return (run_observers([o], x[:n, :, :1] + wrong[:, None, None], u[:n])[0] - x[:n])[:, 0]
+        return (next(run_observers([o], x[:n, :, :1] + wrong[:, None, None], u[:n])) - x[:n])[:, 0]
 
     offset, noise = error(np.ones(500))[-1], error(np.random.default_rng(3).normal(size=len(x)))[500:].std(axis=0)
     for i, state in enumerate("xv"):

@@ -21,7 +21,7 @@ def population_of(count):
 def run(batch):
     """Two estimates, with a memory behind their states."""
     memory = np.ones((*batch.states.shape[:2], 1))
-    return [np.concatenate([share * batch.states, memory], axis=-1)[None] for share in (0.9, 1.2)]
+    return [np.concatenate([share * batch.states, memory], axis=-1) for share in (0.9, 1.2)]
 
 
 @pytest.mark.parametrize("at_once", [1, 3, 7])

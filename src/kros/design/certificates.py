@@ -188,7 +188,7 @@ def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> 
     y, states, inputs = batch.measurements(q)[first:], batch.states[first:], batch.inputs[first:]
     recorded = np.arange(n) < states.shape[-1]
     inside = (np.arange(first, first + len(y))[:, None] < batch.lengths)[..., None]
-    x = run_observers(observers, y, inputs, observers[0].own(batch.parameters))
+    x = np.stack([*run_observers(observers, y, inputs, observers[0].own(batch.parameters))])
     least, most = np.full(n, np.inf), np.full(n, -np.inf)
     least[recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
     most[recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)

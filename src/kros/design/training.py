@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import field, replace
 from functools import cached_property
-from itertools import chain, zip_longest
+from itertools import zip_longest
 
 import numpy as np
 
@@ -13,11 +13,11 @@ from ..core import TINY, Array, frozen, grouped
 from ..data import EpisodeBatch, EpisodeKey, Population
 from ..data.prepare import scale_population
 from ..evaluate.errors import error_rms, largest
-from ..evaluate.held_out import observers_run
 from ..evaluate.sensor import as_shown
 from ..identify import IdentifiedModels, ModelSet
 from ..observer import Observer, Runtime, Seen, delay_of, spread
 from ..observer.sensor import Sensors, in_units
+from ..observer.simulate import run_observers
 
 
 @frozen
@@ -115,9 +115,9 @@ def percent_of(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
     x, lengths, y = batch.states, batch.lengths, batch.measurements(observers[0].measured)
     size, groups = largest(x, lengths), np.array([f"{key.unit}\n{key.condition}" for key in batch.keys])
     size = np.array([size[groups == group].max(axis=0) for group in groups])
-    runs = observers_run(observers)(batch.keys, y, batch.inputs, batch.parameters)
+    runs = run_observers(observers, y, batch.inputs, observers[0].own(batch.parameters))
     with np.errstate(divide="ignore", invalid="ignore"):
-        rms = (error_rms(e[..., : x.shape[-1]], x, lengths) for e in chain.from_iterable(runs))
+        rms = (error_rms(e[..., : x.shape[-1]], x, lengths) for e in runs)
         percents = np.array([100 * error / size for error in rms])
     units = np.array([key.unit for key in batch.keys])
     by_unit = np.stack([percents[:, units == unit].mean(axis=1) for unit in dict.fromkeys(units)])

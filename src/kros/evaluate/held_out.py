@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field, replace
-from itertools import chain
 
 import numpy as np
 
@@ -20,18 +19,6 @@ from .sensor import as_shown
 Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
 SIDE_BY_SIDE = 16  # episodes
 _TOGETHER = 8  # observers, at most
-_NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again
-
-
-def observers_run(observers: Sequence[Observer]) -> Run:
-    """Return what runs observers that `alike` puts together, as many at once as fill a memory."""
-
-    def run(keys: Sequence[EpisodeKey], y: Array, u: Array, values: Mapping[str, Array]) -> Iterator[Array]:
-        count = _NUMBERS // (y.shape[0] * y.shape[1] * observers[0].lifting.n_states)
-        for part in pieces(len(observers), count):
-            yield run_observers(observers[part], y, u, observers[0].own(values))
-
-    return run
 
 
 def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
@@ -63,7 +50,10 @@ class HeldOut:
 
     def observers(self, observers: Sequence[Observer]) -> list[Outcome]:
         """Run observers that `alike` puts together."""
-        return self.estimates(observers_run(observers), observers[0].measured)
+        first = observers[0]
+        return self.estimates(
+            lambda keys, y, u, values: run_observers(observers, y, u, first.own(values)), first.measured
+        )
 
     def estimates(self, run: Run, measured: Sequence[int]) -> list[Outcome]:
         """Run estimators on what the sensor shows of the measured states."""
@@ -80,18 +70,18 @@ class HeldOut:
             x, inputs = np.swapaxes(batch.states, 0, 1), np.swapaxes(batch.inputs, 0, 1)
             first = x[:, : models.lifting.history + 1]
             states = free_run(models.A[rows], models.B[rows], models.lifting, values, first, inputs)
-            return [np.swapaxes(states, 0, 1)[None]]
+            return [np.swapaxes(states, 0, 1)]
 
         (outcome,) = replace(self, sensor={}, band_hz=None).outcomes(run, truths=False)
         return outcome
 
     def outcomes(self, run: Callable[[EpisodeBatch], Iterable[Array]], truths: bool = True) -> list[Outcome]:
-        """Return the outcomes of estimates, (estimate, n_samples, batch, n or more), some episodes after others."""
+        """Return the outcomes of estimates, (n_samples, batch, n or more) each, some episodes after others."""
         outcomes, n = list[Outcome](), len(self.population.states)
         for part in pieces(len(self.keys) or 1, SIDE_BY_SIDE):  # none at all are refused where they are read
             batch = self.read(self.keys[part], truths)
             shown = [(i, key) for i, key in enumerate(batch.keys) if key in self.shown]
-            for place, estimate in enumerate(chain.from_iterable(run(batch))):
+            for place, estimate in enumerate(run(batch)):
                 if part.start == 0:
                     outcomes.append(Outcome())
                 outcomes[place].errors.update(self.errors(estimate[..., :n], batch))
@@ -136,7 +126,7 @@ class HeldOut:
 
     def recorded(self) -> Outcome:
         """Take the recorded states for estimates: their errors against the true ones are known."""
-        (outcome,) = replace(self, sensor={}, band_hz=None, shown=()).outcomes(lambda batch: [batch.states[None]])
+        (outcome,) = replace(self, sensor={}, band_hz=None, shown=()).outcomes(lambda batch: [batch.states])
         return replace(outcome, estimated=self.population.true_states)
 
 

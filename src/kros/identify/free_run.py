@@ -64,7 +64,7 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Arra
     if (loops := library()) is not None:
         column, states = np.zeros((width + n_lifted, batch)), np.empty((n_samples, n, batch))
         column[:n], states[:h] = window[:, :n].T, first[:, :h].transpose(1, 2, 0)
-        job = {"observers": 1, "samples": n_samples - h, "batch": batch, "own": rows.ndim == 3, "map": rows}
+        job = {"samples": n_samples - h, "batch": batch, "own": rows.ndim == 3, "map": rows}
         job |= {"u": u[:, h:].transpose(1, 2, 0), "column": column, "states": states[h:]}
         job["past"] = np.ascontiguousarray(window[:, n:])
         loops.call("kros_relift", formulas(lifting, parameters, m, batch), ("relift_job", job))

@@ -137,7 +137,6 @@ def recursion(F: Array, driven: Array, first: Array, G: Array | None = None) -> 
         states, column = np.empty((n_samples, n, batch)), np.zeros((n + m, batch))
         column[:n] = first.T
         job = {
-            "observers": 1,
             "samples": n_samples,
             "batch": batch,
             "map": np.hstack([F, np.eye(n) if G is None else G]),

@@ -40,32 +40,31 @@ typedef struct {
     const double *values;     /* (parameters, batch) */
 } formulas;
 
-/* Observers and free runs: [x+; c+] = map [theta; c; u; y], re-lifted at every sample. */
+/* An observer or free runs: [x+; c+] = map [theta; c; u; y], re-lifted at every sample. */
 typedef struct {
-    whole observers;
     whole samples;
     whole batch;
     whole order;       /* of the correction */
     whole q;
-    whole own;         /* every machine has a map of its own: one observer, map (batch, rows, columns) */
+    whole own;         /* every machine has a map of its own: map (batch, rows, columns) */
     whole fresh;       /* earlier values equal the present ones at the first sample */
     whole recorded;    /* first states; the last ones are those after a start, those from inputs alone, and how far apart they are; none */
     whole kinds;       /* of gaps: of all measurements, and of some */
     whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
-    const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
+    const double *map;        /* (n + order, n_lifted + order + n_inputs + q) */
     const double *y;          /* (samples, q, batch); none where nothing is measured */
     const double *u;          /* (samples, m, batch) */
     const int32_t *measured;  /* (q) */
-    const double *low;        /* (observers, n + order): bounds; none */
+    const double *low;        /* (n + order): bounds; none */
     const double *high;
-    uint8_t *left;            /* (observers): whether a machine would leave the bounds; its numbers are then of no use */
-    double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
-    double *past;             /* (observers, batch, earlier), moved on */
+    uint8_t *left;            /* (1): whether a machine would leave the bounds; all numbers are then of no use */
+    double *column;           /* (columns, batch): x and c in their rows, moved on */
+    double *past;             /* (batch, earlier), moved on */
     const double *reach;      /* (recorded) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
     const double *bank;       /* (3 kinds + 1, recorded, batch): half, recovery, longest age, recovery of a start */
     double *gap;              /* (kinds recorded + q + 1 + q filters, batch): age, count, age of the start or the last loss, ramps; moved on */
-    double *states;           /* (samples, observers, n, batch): x before every sample; none */
+    double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
 
 /* Free runs with sensitivities: see kros.identify.refine.sensitivity for the symbols. */
@@ -214,11 +213,11 @@ static void product_each(const vec *map, whole columns, const vec *const *column
 }
 
 /* Whether the next states and corrections of all machines are within the bounds. */
-static int within(const relift_job *s, whole o, whole rows, const vec *next, whole lanes)
+static int within(const relift_job *s, whole rows, const vec *next, whole lanes)
 {
     int inside = 1;
     for (whole i = 0; s->low && i < rows; i++) {
-        const double low = s->low[o * rows + i], high = s->high[o * rows + i];
+        const double low = s->low[i], high = s->high[i];
         for (whole b = 0; b < lanes; b++) inside &= LANES(next + i * MOST)[b] >= low && LANES(next + i * MOST)[b] <= high;
     }
     return inside;
@@ -365,57 +364,55 @@ int kros_relift(const formulas *f, const relift_job *s)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
         for (whole i = 0; i < numbers; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
         for (whole i = 0; i < gaps; i++) gather(gap + i * MOST, s->gap + i * batch + first, 1, lanes);
-        for (whole o = 0; o < s->observers; o++) {
-            double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;
-            for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
-            for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
-            for (whole e = 0; e < ne; e++) gather(reg + (n + e) * MOST, past + e, ne, lanes);
-            for (whole i = 0, used = 0, at = 0; i < rows; i += s->own ? rows : 4) {
-                const whole before = used;
-                for (whole j = 0; j < columns; j++) {
-                    const double *from = s->map + (o * rows + i) * columns + j;
-                    whole there = s->own, k = j;
-                    for (whole l = 0; l < 4 && i + l < rows && !there; l++) there = from[l * columns] != 0.0;
-                    if (!there) continue;
-                    if (k < f->n_lifted) column[used++] = reg + f->lifted[k] * MOST;
-                    else if ((k -= f->n_lifted) < order) column[used++] = c + k * MOST;
-                    else if ((k -= order) < f->n_inputs) column[used++] = reg + f->lifted[f->n_lifted + k] * MOST;
-                    else column[used++] = y + (k - f->n_inputs) * MOST;
-                    for (whole l = 0; l < 4 && !s->own; l++) map[at++] = i + l < rows ? from[l * columns] : 0.0;
-                }
-                counts[i / 4] = used - before;
+        double *state = s->column + first, *past = s->past ? s->past + first * ne : NULL;
+        for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
+        for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
+        for (whole e = 0; e < ne; e++) gather(reg + (n + e) * MOST, past + e, ne, lanes);
+        for (whole i = 0, used = 0, at = 0; i < rows; i += s->own ? rows : 4) {
+            const whole before = used;
+            for (whole j = 0; j < columns; j++) {
+                const double *from = s->map + i * columns + j;
+                whole there = s->own, k = j;
+                for (whole l = 0; l < 4 && i + l < rows && !there; l++) there = from[l * columns] != 0.0;
+                if (!there) continue;
+                if (k < f->n_lifted) column[used++] = reg + f->lifted[k] * MOST;
+                else if ((k -= f->n_lifted) < order) column[used++] = c + k * MOST;
+                else if ((k -= order) < f->n_inputs) column[used++] = reg + f->lifted[f->n_lifted + k] * MOST;
+                else column[used++] = y + (k - f->n_inputs) * MOST;
+                for (whole l = 0; l < 4 && !s->own; l++) map[at++] = i + l < rows ? from[l * columns] : 0.0;
             }
-            for (whole k = 0; k < s->samples; k++) {
-                if (s->states)
-                    for (whole i = 0; i < n; i++) scatter(s->states + ((k * s->observers + o) * n + i) * batch + first, reg + i * MOST, 1, lanes);
-                for (whole j = 0; j < q; j++) { /* what is predicted stands for what is missing */
-                    const vec *x = reg + s->measured[j] * MOST;
-                    gather(y + j * MOST, s->y + (k * q + j) * batch + first, 1, lanes);
-                    for (whole v = 0; v < w && !recorded; v++) {
-                        const vec seen = y[j * MOST + v];
-                        y[j * MOST + v] = either(seen - seen == 0.0, seen, x[v]);
-                    }
-                }
-                if (recorded) fill(s, bank, gap, reg, y, (mask *)missing, n, w);
-                for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
-                for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
-                evaluate(f, reg, lanes);
-                if (s->own) product_each(each, columns, column, next, rows, w);
-                else product(map, counts, column, next, rows, w);
-                shifted(f, reg, older);
-                if (recorded) follow(f, reg, s, bank, gap, next, (const mask *)missing, ramp, n, columns, w);
-                if (!within(s, o, rows, next, lanes)) {
-                    s->left[o] = 1;
-                    break;
-                }
-                memcpy(reg, next, (size_t)n * MOST * sizeof(vec));
-                memcpy(c, next + n * MOST, (size_t)order * MOST * sizeof(vec));
-                memcpy(reg + n * MOST, older, (size_t)ne * MOST * sizeof(vec));
-            }
-            for (whole i = 0; i < n; i++) scatter(state + i * batch, reg + i * MOST, 1, lanes);
-            for (whole i = 0; i < order; i++) scatter(state + (f->n_lifted + i) * batch, c + i * MOST, 1, lanes);
-            for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
+            counts[i / 4] = used - before;
         }
+        for (whole k = 0; k < s->samples; k++) {
+            if (s->states)
+                for (whole i = 0; i < n; i++) scatter(s->states + (k * n + i) * batch + first, reg + i * MOST, 1, lanes);
+            for (whole j = 0; j < q; j++) { /* what is predicted stands for what is missing */
+                const vec *x = reg + s->measured[j] * MOST;
+                gather(y + j * MOST, s->y + (k * q + j) * batch + first, 1, lanes);
+                for (whole v = 0; v < w && !recorded; v++) {
+                    const vec seen = y[j * MOST + v];
+                    y[j * MOST + v] = either(seen - seen == 0.0, seen, x[v]);
+                }
+            }
+            if (recorded) fill(s, bank, gap, reg, y, (mask *)missing, n, w);
+            for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
+            for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
+            evaluate(f, reg, lanes);
+            if (s->own) product_each(each, columns, column, next, rows, w);
+            else product(map, counts, column, next, rows, w);
+            shifted(f, reg, older);
+            if (recorded) follow(f, reg, s, bank, gap, next, (const mask *)missing, ramp, n, columns, w);
+            if (!within(s, rows, next, lanes)) {
+                s->left[0] = 1;
+                break;
+            }
+            memcpy(reg, next, (size_t)n * MOST * sizeof(vec));
+            memcpy(c, next + n * MOST, (size_t)order * MOST * sizeof(vec));
+            memcpy(reg + n * MOST, older, (size_t)ne * MOST * sizeof(vec));
+        }
+        for (whole i = 0; i < n; i++) scatter(state + i * batch, reg + i * MOST, 1, lanes);
+        for (whole i = 0; i < order; i++) scatter(state + (f->n_lifted + i) * batch, c + i * MOST, 1, lanes);
+        for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
         for (whole i = 0; i < gaps; i++) scatter(s->gap + i * batch + first, gap + i * MOST, 1, lanes);
     }
     free(bank), free(gap), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);

@@ -128,11 +128,9 @@ class Guard:
 
 
 def bounds(guard: Guard | None, n: int, order: int) -> tuple[Array, Array]:
-    """Return the bounds of [x; x^c], those of a padded correction too: products of what is within are finite."""
-    most = float(np.sqrt(np.finfo(float).max))
-    low, high = np.full(n + order, -most), np.full(n + order, most)
-    if guard is not None:
-        size = n + len(guard.correction)
-        high[:size] = np.minimum(np.append(guard.upper, guard.correction), most)
-        low[:size] = np.maximum(np.append(guard.lower, -guard.correction), -most)
-    return low, high
+    """Return the bounds of [x; x^c], (n + order,): products of what is within are finite."""
+    most = np.full(n + order, float(np.sqrt(np.finfo(float).max)))
+    if guard is None:
+        return -most, most
+    low, high = np.append(guard.lower, -guard.correction), np.append(guard.upper, guard.correction)
+    return np.maximum(low, -most), np.minimum(high, most)

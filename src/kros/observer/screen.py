@@ -22,10 +22,8 @@ and a start costs no more than a start. Parameters stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from enum import IntFlag
-from typing import Any
 
 import numpy as np
 
@@ -35,7 +33,6 @@ from .data import ObserverData
 from .runtime import Seen
 
 BEYOND = 1.5  # times the range: what is further away is implausible
-_SIGNALS = ("y", "u", "status", "starts", "complete")
 LONGEST = 5  # samples for which an input may be held without a new start, except in filter banks, which forget it
 NEVER = 2**32 - 1  # samples since an input that was never known
 
@@ -99,18 +96,6 @@ class Screened:
     starts: Flags  # (n_samples, batch)
     complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
-
-    def rows(self, part: slice) -> Screened:
-        """Return some samples of all members."""
-        return self.each(lambda name: getattr(self, name)[part])
-
-    def after(self, before: Screened) -> Screened:
-        """Return the samples behind earlier ones."""
-        return self.each(lambda name: np.concatenate([getattr(before, name), getattr(self, name)]))
-
-    def each(self, signal: Callable[[str], Any]) -> Screened:
-        """Return the same with other signals, by name."""
-        return replace(self, **{name: signal(name) for name in _SIGNALS})
 
 
 @frozen

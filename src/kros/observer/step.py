@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Array, Flags, Index, Parameters
+from ..core.arrays import Array, Flags, Index, Parameters, Record
 from .data import ObserverData
 from .filter_bank import OLDEST, Gaps
 from .runtime import bounds
@@ -20,6 +20,7 @@ class Steps:
         n = lifting.n_states
         self.observer, self.lifting, self.values = observer, lifting, values
         self._map, self._measured = observer.one_step, list(observer.measured)
+        self._correction = slice(lifting.n_lifted, lifting.n_lifted + order)
         self.x, self.x_c = np.zeros((batch, n)), np.zeros((batch, order))
         self.past, self.fresh = np.zeros((batch, len(lifting.window.earlier))), np.ones(batch, dtype=bool)
         self._low, self._high = bounds(observer.guard, n, order)
@@ -78,6 +79,34 @@ class Steps:
         if delays:
             np.copyto(self.past, self.lifting.window.advance(window, u), where=on)
             self.fresh &= ~on[:, 0]
+
+    @property
+    def job(self) -> Record:
+        """What the compiled loop goes on from."""
+        column = np.zeros((self._map.shape[1], len(self.x)))
+        column[: self.lifting.n_states] = self.x.T
+        column[self._correction] = self.x_c.T
+        job = {
+            "order": self.x_c.shape[1],
+            "q": len(self._measured),
+            "map": self._map,
+            "measured": self._measured,
+            "past": self.past.copy(),
+            "fresh": int(self.fresh.any()),
+            "left": np.zeros(1, np.uint8),
+            "low": self._low,
+            "high": self._high,
+            "column": column,
+        }
+        return job if self.gaps is None else job | self.gaps.job
+
+    def take(self, job: Record) -> None:
+        """Go on from where the compiled loop ended."""
+        column = job["column"]
+        self.x, self.x_c = column[: self.lifting.n_states].T.copy(), column[self._correction].T.copy()
+        self.past, self.fresh = job["past"], np.zeros_like(self.fresh)
+        if self.gaps is not None:
+            self.gaps.take(job["gap"])
 
     def _into_filters(self, window: Array, u: Array) -> Array:
         """Return the slopes of the next filters by the measurements, shape (batch, filters, q)."""

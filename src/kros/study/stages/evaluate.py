@@ -80,7 +80,7 @@ def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> list[Outcome
         baseline = make()
     except KrosError as error:
         return [Outcome(facts={"status": "failed", "reason": str(error)})]
-    outcomes = episodes.estimates(lambda *batch: [baseline.estimate(*batch)[None]], baseline.measured)
+    outcomes = episodes.estimates(lambda *batch: [baseline.estimate(*batch)], baseline.measured)
     return [replace(outcome, facts=baseline.facts, estimated=baseline.estimated) for outcome in outcomes]
 
 

@@ -183,5 +183,5 @@ class RunningObserver:
         ahead, steps = self._course.ahead(), self._course.steps
         if len(ahead):
             x = forward(self.observer, steps.values, np.array([len(ahead)]), x, steps.earlier(ahead[0]), ahead)
-        recorded = self.observer.runtime.clip_estimate(x[0, : len(self.states)])
+        recorded = self.observer.runtime.clip_estimate(x[0, : len(self.states)].copy())
         return Estimate(zip(self.states, recorded.tolist(), strict=True))

@@ -103,9 +103,12 @@ class Runtime:
         low, high = self.sides(x.shape[-1])
         return np.asarray(((x <= low) | (x >= high)).any(axis=-1))
 
-    def clip_estimate(self, x: Array, out: Array | None = None) -> Array:
-        """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
-        return np.clip(x, *self.sides(x.shape[-1]), out=out) if self.limits() else x
+    def clip_estimate(self, x: Array) -> Array:
+        """Bring estimates or recorded states, the first ones, (..., n), within their limits, in place."""
+        low, high = self.sides(x.shape[-1])
+        for i in np.flatnonzero(np.isfinite(low) | np.isfinite(high)):
+            np.clip(x[..., i], low[i], high[i], out=x[..., i])
+        return x
 
 
 @frozen

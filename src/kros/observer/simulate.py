@@ -238,7 +238,7 @@ def _finished(course: Course, samples: Screened, run: Stepped, earlier: Array, p
     run.status[taken & np.concatenate(met)] |= np.uint8(SampleStatus.LIMIT)
     if runtime.delay:
         _predict(course, x, earlier, pending, u)
-    runtime.clip_estimate(x, out=x)
+    runtime.clip_estimate(x)
     course.held, course.inputs = samples.held, u[max(0, len(u) - runtime.delay) :].copy()
     return run
 

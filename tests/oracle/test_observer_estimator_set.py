@@ -210,7 +210,9 @@ def test_functions_of_the_model_count_and_others_are_refused():
     _, rows, _, weight = zip(
         *design.rows(design.recordings.some(SETTINGS.sample_episodes), SETTINGS.sample), strict=True
     )
-    of_sine = np.where(design.bank.channel[:, None] == 1, found.readout.coefficients, 0.0)  # the sine is channel 1
+    of_sine = np.where(
+        design.bank.channel[:, None] == 1, found.readout.coefficients[:, : len(lifting.states)], 0.0
+    )  # the sine is channel 1
     added, weight = np.vstack(rows) @ of_sine, np.concatenate(weight) / np.concatenate(weight).sum()
     shares, size = outside_percent(found.readout, LIFTING), design.recordings.size
     np.testing.assert_allclose(shares, 100 * np.sqrt(weight @ added**2) / size, rtol=1e-9)

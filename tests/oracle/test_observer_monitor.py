@@ -40,7 +40,7 @@ def test_one_machine_is_watched_as_many_at_once(machine, bound):
     outside = (status & SampleStatus.UNCERTIFIED) > 0
     np.testing.assert_array_equal(outside, wanted > 0)
     assert 0.05 < outside.mean() < 0.95
-    course = Course(observer, watch=Watch.of(observer.monitor))
+    course = Course(observer, watched=True)
     blocks = [course.take(y[part, None], u[part, None]).status[:, 0] for part in (slice(300), slice(300, None))]
     np.testing.assert_array_equal(np.concatenate(blocks), status)
 
@@ -50,7 +50,7 @@ def test_one_machine_is_watched_as_many_at_once(machine, bound):
 def test_blocks_and_single_samples_have_the_same_status(kind, lost):
     """Compiled where no start comes again, else step by step."""
     observer, (y, u) = MACHINES[kind](), samples(700, faults=lost)
-    course, blocks = Course(observer, watch=Watch.of(observer.monitor)), [slice(k, k + 175) for k in range(0, 700, 175)]
+    course, blocks = Course(observer, watched=True), [slice(k, k + 175) for k in range(0, 700, 175)]
     found = np.concatenate([course.take(y[block, None], u[block, None]).status[:, 0] for block in blocks])
     np.testing.assert_array_equal(found, in_python(observer, y, u)[1])
     assert bool(found.any()) == (lost or "limits" in kind or "monitor" in kind)

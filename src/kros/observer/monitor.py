@@ -116,11 +116,6 @@ class Watch:
         self._monitor = monitor
         self.begin()
 
-    @classmethod
-    def of(cls, monitor: Monitor | None) -> Watch | None:
-        """Return the watch of an observer that has a monitor."""
-        return None if monitor is None else cls(monitor)
-
     def begin(self) -> None:
         """Forget everything."""
         self._filters, self._squares = np.zeros((2, *self._monitor.limits.shape)), np.zeros(self._monitor.limits.shape)

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..core import AnyArray, Array, ArrayLike, DimensionError, Names
 from .data import ObserverData
-from .monitor import Watch
 from .screen import Held, SampleStatus, Screen, Screened, numbers
 from .simulate import Course, stepped
 from .step import forward
@@ -64,7 +63,7 @@ class RunningObserver:
     def __init__(self, observer: ObserverData, y: ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
         self._screen = Screen.of(observer)
-        self._course = Course(observer, 1, parameters, watch=Watch.of(observer.monitor))
+        self._course = Course(observer, 1, parameters, watched=True)
         self.parameters = parameters
         self.reset(y)
 

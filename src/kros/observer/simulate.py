@@ -115,9 +115,9 @@ class Course:
         batch: int = 1,
         parameters: Parameters | None = None,
         loop: Any = None,
-        watch: Watch | None = None,  # of one machine
+        watched: bool = False,  # by its monitor: one machine
     ) -> None:
-        self.watch = watch
+        self.watch = Watch(observer.monitor) if watched and observer.monitor is not None else None
         self.values: dict[str, Any] = {k: v + np.zeros(batch) for k, v in observer.values(parameters, (batch,)).items()}
         self.observer, self.loop, self.steps = observer, loop, Steps(observer, batch, self.values)
         self.settling = np.zeros(batch, dtype=int)  # samples until a start has settled

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import re
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -80,12 +82,13 @@ def export_c(
 
 def c_files(source: Source) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
-    name, state_bytes = source.name, _state_bytes(source)
-    texts = {f"{name}.h": "observer.h", f"{name}.c": "observer.c", f"{name}_selftest.c": "selftest.c"}
+    name, more = source.name, {"version": version("kros"), **_golden(source)}
+    files = source.rendered("kros.export.c99", {f"{name}.h": "observer.h"}, more)
+    more["state_bytes"] = _state_bytes(files[f"{name}.h"], 4 if source.precision.type == "float" else 8)
+    texts = {f"{name}.c": "observer.c", f"{name}_selftest.c": "selftest.c"}
     texts |= {file: file for file in ("example_main.c", "CMakeLists.txt", "README.md")}
-    more = {"version": version("kros"), "state_bytes": state_bytes, **_golden(source)}
-    manifest = json_bytes(_manifest(source, state_bytes)).decode()
-    return source.rendered("kros.export.c99", texts, more) | {"manifest.json": manifest}
+    files |= source.rendered("kros.export.c99", texts, more)
+    return files | {"manifest.json": json_bytes(_manifest(source, more["state_bytes"])).decode()}
 
 
 def _golden(source: Source) -> Record:
@@ -137,18 +140,15 @@ def _sample(value: float) -> str:
     return "ABSENT" if np.isnan(value) else "BEYOND"
 
 
-def _state_bytes(source: Source) -> int:
-    """Return the size of the state: doubles first, then numbers of the build's precision, then words of four bytes."""
-    o, q, m = source.observer, len(source.observer.measured), len(source.observer.inputs)
-    real, n, order = 4 if source.precision.type == "float" else 8, o.lifting.n_states, o.controller.n_states
-    doubles = m + (1 + m + len(source.shift_others) if source.shift else 0)
-    reals = n + order + len(o.lifting.window.earlier) + len(o.lifting.parameters) + o.runtime.delay * m
-    reals += n + order + 2 if source.loop else 0
-    reals += o.bank.half.size + q * (o.bank.filters + 1) + 1 if o.bank else 0
-    reals += q * len(o.monitor.filters) * 3 + 1 if o.monitor else 0
-    words = m + bool(o.runtime.delay) + bool(o.monitor) + 2
-    align = 8 if doubles or real == 8 else 4
-    return -(-(8 * doubles + real * reals + 4 * words) // align) * align
+def _state_bytes(header: str, real: int) -> int:
+    """Return the size of the state that a header declares; larger numbers come before smaller ones."""
+    declared = header[header.index("typedef struct {") : header.index("_state;")]
+    sizes, counts = {"double": 8, "uint32_t": 4}, dict[int, int]()
+    for kind, shape in re.findall(r"^    (\w+) \w+((?:\[\d+\])*);", declared, re.MULTILINE):
+        size = sizes.get(kind, real)
+        counts[size] = counts.get(size, 0) + math.prod(map(int, re.findall(r"\d+", shape)))
+    align = max(counts)
+    return -(-sum(size * count for size, count in counts.items()) // align) * align
 
 
 @frozen

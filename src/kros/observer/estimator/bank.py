@@ -135,33 +135,24 @@ class Bank:
 
     def system(self) -> tuple[Array, Array, Array]:
         """Return A (p, p), B (p, channels) and S (p, channels)."""
-        size, c, moving, delayed = len(self), self.channels, self.channels - 1, self.delayed
-        A, B, S = np.zeros((size, size)), np.zeros((size, c)), np.zeros((size, c))
-        B[range(moving), range(moving)] = S[range(moving), range(moving)] = 1.0
-        place = moving
-        for i in range(self.delays - 1):
-            rows = np.arange(place, place + delayed)
-            if i == 0:
-                B[rows, range(delayed)], A[rows, range(delayed)] = 1.0, -1.0
-            else:
-                A[rows, rows - delayed] = 1.0
-            place += delayed
-        for tau in self.lags:
-            rows, a = np.arange(place, place + moving), np.exp(-1 / tau)
-            A[rows, rows], B[rows, range(moving)], S[rows, range(moving)] = a, 1 - a, 1.0
-            place += moving
-        for resonance in self.resonances:
-            rows, p = np.arange(place, place + moving), np.exp(-1 / resonance)
-            others = rows + len(self.resonances) * moving
-            A[rows, rows], A[rows, others], A[others, rows], A[others, others] = p.real, -p.imag, p.imag, p.real
-            B[rows, range(moving)], B[others, range(moving)], S[rows, range(moving)] = 1 - p.real, -p.imag, 1.0
-            place += moving
-        place += len(self.resonances) * moving
-        for tau in self.starts:
-            rows, a = np.arange(place, place + c), np.exp(-1 / tau)
-            A[rows, rows], S[rows, range(c)] = a, 1 / a
-            place += c
-        B[-1, -1] = S[-1, -1] = 1.0
+        size, place = len(self), {entry: i for i, entry in enumerate(self.entries)}
+        A, B, S = np.zeros((size, size)), np.zeros((size, self.channels)), np.zeros((size, self.channels))
+        for i, (kind, tau, channel) in enumerate(self.entries):
+            a = np.exp(-1 / tau) if tau else 0.0
+            match kind:
+                case "value" | "lag":
+                    A[i, i], B[i, channel], S[i, channel] = a, 1 - a, 1.0
+                case "real":
+                    A[i, i], A[i, place["imaginary", tau, channel]] = a.real, -a.imag
+                    B[i, channel], S[i, channel] = 1 - a.real, 1.0
+                case "imaginary":
+                    A[i, i], A[i, place["real", tau, channel]], B[i, channel] = a.real, a.imag, -a.imag
+                case "start":
+                    A[i, i], S[i, channel] = a, 1 / a
+                case _ if tau == 1:  # the last step
+                    A[i, place["value", 0, channel]], B[i, channel] = -1.0, 1.0
+                case _:
+                    A[i, place["step", tau - 1, channel]] = 1.0
         return A, B, S
 
 

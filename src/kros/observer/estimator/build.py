@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...core import Array, ConfigError, frozen, gain
+from ...core.linalg import spectral_radius
 from ...lifting import Lifting
 from ...synthesis.result import Injection
 from ..filter_bank import FilterBank
@@ -91,13 +92,11 @@ def identify_estimator(
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
         return assembled(name, lifting, inputs, readout.design, (filters, fallback), sample_period_s, parameters or {})
 
-    def filters_of(one: Readout, other: Readout, orders: Sequence[int | None]) -> tuple[Filters, Filters]:
-        both = np.hstack([one.coefficients, one.careful])
-        return reduced(one, orders[0], both), reduced(other, orders[1])
+    def fallback_of(one: Readout, order: int | None) -> Filters:
+        return reduced(replace(one, coefficients=one.coefficients[:, :n]), order)
 
-    filters, fallback = filters_of(readout, blind, [settings.order] * 2)
-    observer = observer_of(filters, fallback)
-    orders = len(filters.A), len(fallback.A)
+    filters, fallback = reduced(readout, settings.order), fallback_of(blind, settings.order)
+    observer, orders = observer_of(filters, fallback), (len(filters.A), len(fallback.A))
     F, apart = distances(observer, recordings, settings, held)
     near = [i for i in measured if i not in held]
 
@@ -108,14 +107,18 @@ def identify_estimator(
         return replace(let_go(one, F), runtime=bounded(one, recordings, settings), bank=replace(one.bank, reach=reach))
 
     trials = [
-        (complete(observer_of(*filters_of(readout.without(group), blind.without(group), orders))), unseen)
+        (
+            complete(
+                observer_of(reduced(readout.without(group), orders[0]), fallback_of(blind.without(group), orders[1]))
+            ),
+            unseen,
+        )
         for group, unseen in readout.left_out_groups()
     ]
     observer = complete(observer)
     assert observer.bank is not None
     bank = with_gaps(observer.bank, trials, F, settings)
-    observer = replace(observer, bank=bank)
-    states = lifting.states
+    observer, states = replace(observer, bank=bank), lifting.states
 
     def by_state(values: Array) -> dict[str, float]:
         return dict(zip(states, values.tolist(), strict=True))
@@ -125,8 +128,6 @@ def identify_estimator(
     worst = np.sqrt(readout.episode_errors().max(axis=0))
     facts = {
         "channels": family,
-        "filters": len(filters.A),
-        "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
         "left_out_worst_percent": by_state(100 * worst),
@@ -265,6 +266,5 @@ def let_go(observer: Observer, F: Array) -> Observer:
 
 def settle_samples(systems: Sequence[Filters], recovery: Array) -> int:
     """Return the samples after which a disturbance is below one percent: five of the slowest time constants."""
-    poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in systems]
-    slowest = max([*poles, *recovery.ravel()])
+    slowest = max([*(float(spectral_radius(f.A)) for f in systems), *recovery.ravel()])
     return int(np.ceil(-5 / np.log(slowest))) if slowest > 0 else 1

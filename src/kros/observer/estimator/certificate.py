@@ -99,8 +99,9 @@ def outside_percent(readout: Readout, modelled: Lifting) -> Array:
     known = {*own.states, *_signals(modelled, own.inputs), CONSTANT}
     texts = [*own.states, *_signals(own, own.inputs)]
     outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
-    added = readout.sample[:, outside] @ readout.coefficients[outside]
-    return 100 * np.linalg.norm(added, axis=0) / design.recordings.size
+    size = design.recordings.size
+    added = readout.sample[:, outside] @ readout.coefficients[outside, : len(size)]
+    return 100 * np.linalg.norm(added, axis=0) / size
 
 
 def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCertificate:

@@ -35,7 +35,6 @@ class Filters:
     C: Array  # (n, r)
     D: Array  # (n, channels)
     S: Array  # (r, channels)
-    singular_values: Array  # all of them, relative to the errors of the estimates
 
     def first(self, order: int) -> Filters:
         """Return the first states alone."""
@@ -73,13 +72,12 @@ class Filters:
         return z @ self.C.T + v @ self.D.T
 
 
-def reduced(readout: Readout, order: int | None = None, coefficients: Array | None = None) -> Filters:
+def reduced(readout: Readout, order: int | None = None) -> Filters:
     """Return the filters of a readout, reduced until left-out errors grow by a share, or to an order.
 
-    The covariance is that of thinned rows of the bank. Other coefficients may take the place of the readout's, for the
-    states once or more.
+    The covariance is that of thinned rows of the bank.
     """
-    design, coefficients = readout.design, readout.coefficients if coefficients is None else coefficients
+    design, coefficients = readout.design, readout.coefficients
     errors = readout.typical * design.recordings.size
     errors[list(design.channels.measured)] *= design.settings.measured_loss
     errors = np.tile(errors, coefficients.shape[1] // len(errors))
@@ -97,11 +95,11 @@ def reduced(readout: Readout, order: int | None = None, coefficients: Array | No
     _, sigma, V = np.linalg.svd(readout.sample / size @ L.T, full_matrices=False)
     scale = np.maximum(sigma, EPS * sigma[:1])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
-    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
+    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S)
     if order is not None:
         return whole.first(order).modal()
     signals = design.sample_signals(_EPISODES, round(10 * max([*design.bank.lags, design.bank.delays])))
-    at, weights = design.thinned([len(signals)], design.settings.sample // _EPISODES)[0]
+    at, weights = next(design.thinned([len(signals)], design.settings.sample // _EPISODES))
     wanted = np.stack([design.bank.rows(v, at) @ coefficients for v in signals.swapaxes(0, 1)], axis=1)
     most = 2 * design.settings.loss
 

@@ -64,7 +64,8 @@ class Moments:
     def of(cls, designs: Sequence[Design], whitenings: Sequence[Whitening]) -> list[Moments]:
         """Sum the rows of every group, for every design: their banks are parts of that of the last."""
         last = designs[-1]
-        some, places = last.training(), [last.bank.places(design.bank) for design in designs]
+        some = last.recordings.some(last.settings.episodes, last.groups)
+        places = [last.bank.places(design.bank) for design in designs]
         groups = tuple(dict.fromkeys(last.groups[key] for key in some.keys))
         count, power = np.zeros(len(groups)), np.zeros((len(groups), len(last.recordings.size)))
         sizes = [whitening.directions.shape[1] for whitening in whitenings]
@@ -111,16 +112,15 @@ class Moments:
             A.flat[:: len(A) + 1] += rounding
             yield q[:, None] * cho_solve(cho_factor(A, overwrite_a=True, check_finite=False), q[:, None] * cross)
 
-    def best(self, errors: Array, among: Flags | None = None) -> Whole:
-        """Return the best candidates of every state for each pair of weights, which come in turn, shape (2, n).
+    def best(self, errors: Array, among: Flags | slice = slice(None)) -> Whole:
+        """Return the best candidates of every state for each pair of weights, which come in turn, shape (2 n,).
 
         They are best by logarithms of errors (groups, candidates, n) on what is left out, among all groups or some.
         """
-        some = slice(None) if among is None else among
         # A state at zero throughout a group would ask for no estimate of it at all.
-        counted = (self.power[some] > 0)[:, None]
-        mean = np.log(errors[some]).mean(axis=0, where=counted | ~counted.any(axis=0))
-        return np.stack([2 * mean[i::2].argmin(axis=0) + i for i in range(2)])
+        counted = (self.power[among] > 0)[:, None]
+        mean = np.log(errors[among]).mean(axis=0, where=counted | ~counted.any(axis=0))
+        return np.concatenate([2 * mean[i::2].argmin(axis=0) + i for i in range(2)])
 
     def known(self, group: Group) -> Flags:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
@@ -142,13 +142,11 @@ class Readout:
 
     design: Design
     sample: Array  # triangle of thinned rows of the bank
-    coefficients: Array  # (p, n)
-    careful: Array  # (p, n), for the time after a start or a loss
+    coefficients: Array  # (p, 2 n): of all states, and of these for the time after a start or a loss
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
     penalties: Array  # (n, 3), and weights of starts elsewhere and of restarts
-    others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
-    careful_others: dict[Group, Array]
+    others: dict[Group, Array]  # coefficients (p, 2 n) that do not know a group, over the sizes
 
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Readout]:
@@ -167,29 +165,20 @@ class Readout:
         candidates = [(penalty, *pair) for penalty, pair in product(settings.penalties, pairs)]
         others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
-        errors, folds, states = np.array(left_out), moments.of_groups("fold"), np.arange(moments.power.shape[1])
-        every = np.array(list(moments.solved(weights, candidates)))
-        best, careful = moments.best(errors)
+        errors, folds, n = np.array(left_out), moments.of_groups("fold"), moments.power.shape[1]
+        states, best = np.tile(np.arange(n), 2), moments.best(errors)
+        coefficients = np.array(list(moments.solved(weights, candidates)))[best, :, states].T
         # What is left out took no part in the choice that it is judged with.
-        nested = [moments.best(errors, folds != fold if np.ptp(folds) else None) for fold in folds]
-        coefficients = every[best, :, states].T
-        unaware, careful_unaware = (
-            {
-                g: whitening.directions @ np.array(each)[choice[i], :, states].T
-                for (g, each), choice in zip(others.items(), nested, strict=True)
-            }
-            for i in range(2)
-        )
+        nested = [moments.best(errors, folds != fold if np.ptp(folds) else slice(None)) for fold in folds]
+        unaware = zip(others.items(), nested, strict=True)
         return cls(
             design,
             whitening.sample,
-            whitening.directions @ coefficients * design.recordings.size,
-            whitening.directions @ every[careful, :, states].T * design.recordings.size,
-            np.array([errors[i, choice[0], states] for i, choice in enumerate(nested)]),
-            moments.errors(coefficients),
-            np.array(candidates)[best],
-            unaware,
-            careful_unaware,
+            whitening.directions @ coefficients * np.tile(design.recordings.size, 2),
+            np.array([errors[i, choice[:n], states[:n]] for i, choice in enumerate(nested)]),
+            moments.errors(coefficients[:, :n]),
+            np.array(candidates)[best[:n]],
+            {g: whitening.directions @ np.array(each)[choice, :, states].T for (g, each), choice in unaware},
         )
 
     def left_out_groups(self) -> list[tuple[Group, Recordings]]:
@@ -210,8 +199,7 @@ class Readout:
 
     def without(self, group: Group) -> Readout:
         """Return the readout that does not know a group."""
-        size = self.design.recordings.size
-        return replace(self, coefficients=self.others[group] * size, careful=self.careful_others[group] * size)
+        return replace(self, coefficients=self.others[group] * np.tile(self.design.recordings.size, 2))
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
@@ -222,7 +210,8 @@ class Readout:
         """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
         design, found = self.design, []
         for key, rows, targets, weights in design.rows(design.recordings, design.settings.rows):
-            found.append(np.average((targets - rows @ self.others[design.groups[key]]) ** 2, axis=0, weights=weights))
+            errors = targets - rows @ self.others[design.groups[key]][:, : targets.shape[1]]
+            found.append(np.average(errors**2, axis=0, weights=weights))
         return np.array(found)
 
 

@@ -107,19 +107,6 @@ class Recordings:
         return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
 
 
-def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[Whole, Array]]:
-    """Yield which samples of every episode are about so many rows, and for how many each stands.
-
-    Each has a sample after it. At the start they are denser than later.
-    """
-    first = min(first, min(lengths) - 1)
-    early = max(1, -(-3 * len(lengths) * first // rows))
-    late = max(1, -(-sum(lengths) // max(1, rows - len(lengths) * (first // early))))
-    for number, length in enumerate(lengths):
-        parts = np.arange(number % early, first, early), np.arange(first + number % late, length - 1, late)
-        yield np.concatenate(parts), np.repeat([float(early), float(late)], [len(part) for part in parts])
-
-
 def interpolated(y: Array) -> Array:
     """Return measurements (n_samples, q) with straight lines over those that are missing."""
     if np.isfinite(y).all():
@@ -196,10 +183,18 @@ class Design:
         for key, (at, weights) in zip(recordings.keys, self.thinned(recordings.lengths, rows), strict=True):
             yield key, recordings.read(key), at, weights
 
-    def thinned(self, lengths: Sequence[int], rows: int) -> list[tuple[Whole, Array]]:
-        """Return which samples of episodes are about so many rows, and for how many each stands, see `thinned`."""
+    def thinned(self, lengths: Sequence[int], rows: int) -> Iterator[tuple[Whole, Array]]:
+        """Yield which samples of every episode are about so many rows, and for how many each stands.
+
+        Each has a sample after it. At the start they are denser than later.
+        """
         first = round(self.settings.start_rows * max(self.settings.start, default=0.0))
-        return list(thinned(lengths, rows, first))
+        first = min(first, min(lengths) - 1)
+        early = max(1, -(-3 * len(lengths) * first // rows))
+        late = max(1, -(-sum(lengths) // max(1, rows - len(lengths) * (first // early))))
+        for number, length in enumerate(lengths):
+            parts = np.arange(number % early, first, early), np.arange(first + number % late, length - 1, late)
+            yield np.concatenate(parts), np.repeat([float(early), float(late)], [len(part) for part in parts])
 
     def rows(self, recordings: Recordings, rows: int) -> Iterator[Rows]:
         """Yield episode, bank rows, targets and weights of every episode.
@@ -216,19 +211,10 @@ class Design:
             targets[:, measured] -= reference / recordings.size[measured]
             yield key, self.seen(v, at), targets, weights
 
-    def training(self) -> Recordings:
-        """Return the episodes of the regression."""
-        return self.recordings.some(self.settings.episodes, self.groups)
-
     def sample(self) -> Sample:
         """Return the moments of thinned rows of some episodes, and of what errors of measurements change them by."""
-        settings, bias, bank, rng = (
-            self.settings,
-            self.recordings.bias,
-            self.bank,
-            np.random.default_rng(self.settings.seed),
-        )
-        triangles, weight = Triangles(len(bank)), 0.0
+        settings, bias, bank = self.settings, self.recordings.bias, self.bank
+        rng, triangles, weight = np.random.default_rng(settings.seed), Triangles(len(bank)), 0.0
         for _, batch, at, weights in self.episodes(self.recordings.some(settings.sample_episodes), settings.sample):
             y = self.measurements(batch)
             v = self.signals(batch, y)

@@ -28,7 +28,6 @@ from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
 from ...identify.calibration import Texts, Values, unit_values
 from ...observer import Observer, SampleStatus
-from ...observer.monitor import Watch
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config
@@ -185,7 +184,7 @@ class FieldRecordings:
             recorded = self.population.read(key)
             arrived = arriving(observer, self.population, {key: recorded}, self.values)
             loop = None if self.name is None else PhaseLockedLoop(observer, self.name, 1)
-            course = Course(observer, 1, arrived.parameters, loop, Watch.of(observer.monitor))
+            course = Course(observer, 1, arrived.parameters, loop, watched=True)
             for block in pieces(len(recorded), _BLOCK):
                 run = course.take(arrived.y[block], arrived.u[block])
                 columns = run.estimates[:, 0, : len(observer.recorded)]

@@ -30,7 +30,7 @@ def test_estimates_have_names_and_are_arrays():
 
 def test_a_controller_of_the_wrong_size_is_refused():
     o = random_observer(LIFTING)
-    with pytest.raises(DimensionError, match="1 innovations to 2 corrections"):
+    with pytest.raises(DimensionError, match="from 1 innovations to 2 corrections of"):
         Observer("x", LIFTING, o.A, o.B, (0,), ("a", "b"), o.controller, Injection.INPUT, 0.001)
     with pytest.raises(DimensionError, match="at least one sample"):
         run_observer(o, np.zeros((5, 2, 1)), np.zeros((4, 2, 2)))

@@ -167,7 +167,7 @@ def test_a_filter_bank_goes_through_its_file(tmp_path: Path) -> None:
         ({"start_recovery": np.array([0.5, 0.5])}, DimensionError, "start_recovery"),
         ({"half": np.zeros((1, 1))}, DataError, "half should be positive"),
         ({"start": np.ones((2, 7))}, DimensionError, "start"),
-        ({"filters": 4}, DimensionError, "at most 1 filters"),
+        ({"filters": 4}, DimensionError, "at most 1 filters of measurements; found .* 4 filters"),
     ],
 )
 def test_a_filter_bank_that_does_not_fit_is_refused(

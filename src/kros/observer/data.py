@@ -117,11 +117,10 @@ class ObserverData:
         width = columns if self.injection is Injection.INPUT else rows
         self._require("the model A", self.A.shape, (rows, rows))
         self._require(f"the model B, of {m} inputs and {columns - m} functions of them,", self.B.shape, (rows, columns))
-        if (K.n_inputs, K.n_outputs) != (q, width):
-            raise DimensionError(
-                f"Observer {self.name}: the controller should map {q} innovations to {width} corrections "
-                f"({self.injection.value} injection), found {K.n_inputs} to {K.n_outputs}."
-            )
+        of_controller = (
+            f"the controller, from {q} innovations to {width} corrections of {self.injection.value} injection,"
+        )
+        self._require(of_controller, K.D.shape, (width, q))
         for key, values in self.runtime.by_state().items():
             self._require(f"runtime.{key}", values.shape, (n,))
         if self.seen is not None:
@@ -135,14 +134,10 @@ class ObserverData:
             shapes = bank.start.shape, bank.half.shape, bank.recovery.shape, bank.reach.shape
             self._require("start, half, recovery and reach", shapes, ((n, rows + columns), ages, ages, recorded))
             self._require("start_recovery", bank.start_recovery.shape, (1,))
-            if not 0 <= bank.filters <= (most := n - 4 * recorded[0]):
+            if not 0 <= bank.filters <= (most := n - 4 * recorded[0]) or K.D.any() or K.n_states:
                 raise DimensionError(
-                    f"Observer {self.name}: its states leave at most {most} filters of measurements, found "
-                    f"{bank.filters}."
-                )
-            if K.D.any() or K.n_states:
-                raise DimensionError(
-                    f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
+                    f"Observer {self.name}: a filter bank has no correction, and of its states at most {most} filters "
+                    f"of measurements; found a correction of order {K.n_states} and {bank.filters} filters."
                 )
         if self.guard is not None:
             sizes = self.guard.lower.shape, self.guard.upper.shape, self.guard.correction.shape

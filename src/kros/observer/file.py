@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, Field, create_model
+from pydantic import AfterValidator, Field, Strict, create_model
 
-from ..core import ByName, DataError, KrosError, Record, Settings, StateSpace, shortened
+from ..core import Array, ByName, DataError, KrosError, Record, Settings, StateSpace, shortened
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
 from ..lifting import Lifting
 from .data import ObserverData
@@ -27,24 +27,25 @@ log = logging.getLogger(__name__)
 SCHEMA, KIND = 5, "observer"
 _PERHAPS = ("lifting_inputs", "input_functions", "sizes", "sensor", "about")  # absent where they are empty
 Name = Annotated[str, Field(min_length=1)]
-Row = list[float]
+Names = tuple[Name, ...]
+Number = Annotated[float, Strict()]
+Whole = Annotated[int, Strict()]
 
 
-def _even(rows: list[Row]) -> list[Row]:
-    """Refuse a matrix with rows of different lengths."""
+def _even(rows: list[list[float]]) -> Array:
+    """Return a matrix; rows of different lengths are refused."""
     if len(lengths := {len(row) for row in rows}) > 1:
         raise ValueError(f"all rows should have the same length, found {sorted(lengths)}")
-    return rows
+    return np.array(rows)
 
 
-Matrix = Annotated[list[Row], AfterValidator(_even)]
-Limits = list[float | None]  # null is infinite
+Row = Annotated[list[Number], AfterValidator(np.array)]
+Matrix = Annotated[list[list[Number]], AfterValidator(_even)]
+Limits = list[Number | None]  # null is infinite
 
 
 class _Part(Settings):
-    """What a part of the file holds; numbers are finite, and nothing is converted."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+    """What a part of the file holds; numbers are finite."""
 
     @classmethod
     def _explain(cls, error: Any) -> str:
@@ -64,7 +65,7 @@ class _Controller(_Model):
 
 def _part(kind: Any) -> Any:
     """Return what the file holds of a part whose fields are numbers, arrays of them, or numbers by name."""
-    types: Record = {"Array": Row | Matrix, "Array | None": Limits, "float": float, "int": int}
+    types: Record = {"Array": Row | Matrix, "Array | None": Limits, "float": Number, "int": Whole}
     held = Record()
     for f in fields(kind):
         needed = f.default is MISSING and f.default_factory is MISSING
@@ -82,19 +83,19 @@ def _field(key: str) -> str:
 
 class _File(_Part):
     name: Name
-    states: list[Name]
-    lifting: list[Name]
-    lifting_inputs: list[Name] = Field(default_factory=list)
-    input_functions: list[Name] = Field(default_factory=list)
-    sizes: list[Any] = Field(default_factory=list)
-    parameters: dict[str, float | None]  # null stands for one that every unit has of its own
-    inputs: list[Name]
-    measured: list[int]
+    states: Names
+    lifting: Names
+    lifting_inputs: Names = ()
+    input_functions: Names = ()
+    sizes: tuple[tuple[Name, Number], ...] = ()
+    parameters: dict[str, Number | None]  # null stands for one that every unit has of its own
+    inputs: Names
+    measured: tuple[Whole, ...]
     injection: str
-    sample_period_s: float = Field(gt=0)
+    sample_period_s: Number = Field(gt=0)
     model: _Model
     controller: _Controller
-    sensor: Record = Field(default_factory=dict)
+    sensor: dict[str, Sensor] = Field(default_factory=dict)
     about: Record = Field(default_factory=dict)
 
 
@@ -155,46 +156,45 @@ def _checked(content: ByName, where: str) -> ObserverData:
     """Return the observer of a file's content."""
     try:
         rest = {key: value for key, value in content.items() if key not in ("schema", "kind", CHECKSUM)}
-        return _observer(_Whole.of(rest, "its content").model_dump())
+        return _observer(_Whole.of(rest, "its content"))
     except KrosError as error:
         raise DataError(f"{where}: {error} Correct the file.") from error
 
 
-def _observer(content: ByName) -> ObserverData:
-    names = [*content["states"], *content["inputs"], *content["parameters"]]
+def _observer(file: Any) -> ObserverData:
+    names = [*file.states, *file.inputs, *file.parameters]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise DataError(
             f"the names of states, inputs and parameters should differ, found {', '.join(twice)} more than once."
         )
-    keys = ("states", "lifting", "parameters", "lifting_inputs", "input_functions", "measured")
-    states, functions, parameters, inputs, gamma, measured = (tuple(content[key]) for key in keys)
-    sizes = tuple((name, float(size)) for name, size in content["sizes"])
-    lifting = Lifting(states, functions, parameters, inputs, gamma, sizes)
+    lifting = Lifting(
+        file.states, file.lifting, tuple(file.parameters), file.lifting_inputs, file.input_functions, file.sizes
+    )
+    measured, order, K = file.measured, len(file.controller.A), file.controller
     if len(set(measured)) < len(measured) or not set(measured) <= set(range(lifting.n_states)):
         raise DataError(
             f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {list(measured)}."
         )
-    order, q = len(content["controller"]["A"]), len(measured)
-    rows = [(content["controller"][key], order if key in "AC" else q) for key in "ABCD"]
-    A, B, C, D = (np.reshape(matrix, (len(matrix), width)) for matrix, width in rows)
-    given = {key: _given(part) for key, part in _given({key: content[key] for key in _PARTS}).items()}
+    columns = ((K.A, order), (K.B, len(measured)), (K.C, order), (K.D, len(measured)))
+    A, B, C, D = (np.reshape(matrix, (len(matrix), width)) for matrix, width in columns)
+    parts = {key: _given(vars(part)) for key in _PARTS if (part := getattr(file, key)) is not None}
     for name, end in (("lower", -np.inf), ("upper", np.inf)):
-        if name in (runtime := given.get("runtime", {})):
+        if name in (runtime := parts.get("runtime", {})):
             runtime[name] = [end if limit is None else limit for limit in runtime[name]]
     return ObserverData(
-        content["name"],
+        file.name,
         lifting,
-        np.array(content["model"]["A"]),
-        np.array(content["model"]["B"]),
+        file.model.A,
+        file.model.B,
         measured,
-        tuple(content["inputs"]),
-        StateSpace(A, B, C, D, content["sample_period_s"]),
-        content["injection"],
-        content["sample_period_s"],
-        {name: value for name, value in content["parameters"].items() if value is not None},
-        sensor={name: Sensor.of(value, f"sensor.{name}") for name, value in content["sensor"].items()},
-        about=content["about"],
-        **{_field(key): _PARTS[key](**part) for key, part in given.items()},
+        file.inputs,
+        StateSpace(A, B, C, D, file.sample_period_s),
+        file.injection,
+        file.sample_period_s,
+        _given(file.parameters),
+        sensor=file.sensor,
+        about=file.about,
+        **{_field(key): _PARTS[key](**part) for key, part in parts.items()},
     )
 
 

@@ -57,6 +57,13 @@ class FilterBank:
         shares = dict.fromkeys(("recovery", "start_recovery"), "shares between 0 and 1")
         floats(self, "Filter bank", **shares, **kinds)
 
+    @property
+    def of_measurements(self) -> Flags:
+        """Which states start when all measurements have arrived, (n,): the first ones, z, and the second estimate."""
+        n, recorded = len(self.start), self.half.shape[1]
+        from_last = n - np.arange(n)
+        return (n - from_last < recorded + self.filters) | ((from_last > 2 * recorded) & (from_last <= 3 * recorded))
+
 
 def level(age: Array, half: Array | float = 1.0) -> Array:
     """Return m at ages of which it is one half at `half`."""
@@ -86,8 +93,6 @@ class Gaps:
         )
         self._A = A[self.filters, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
-        self.of_measurements = np.arange(n) < self.filters.stop  # states that start when all of these have arrived
-        self.of_measurements[self.after_start] = True
         self._most = np.where(self.hidden, bank.reach, np.inf)
         self.take(np.zeros((bank.half.size + q + 1 + q * bank.filters, batch)))
 

@@ -187,9 +187,7 @@ def _choices(measured: Columns, hidden: Sequence[int]) -> list[tuple[int, ...]]:
 
 
 def least_squares(regressors: Array, values: Array) -> Array:
-    """Return the smallest least-squares X of ``regressors X = values``, every regressor in units of its size."""
-    largest = np.abs(regressors).max(axis=0, initial=0.0)
-    largest[largest == 0] = 1.0
-    size = largest * np.sqrt(np.mean((regressors / largest) ** 2, axis=0))
+    """Return the smallest least-squares X of ``regressors X = values``, every regressor in units of its largest value."""
+    size = np.abs(regressors).max(axis=0, initial=0.0)
     size[size == 0] = 1.0
     return np.linalg.lstsq(regressors / size, values, rcond=None)[0] / size[:, None]

@@ -41,7 +41,7 @@ class Steps:
     def _begin_filters(self, y: Array, u: Array, machines: Flags) -> None:
         """Start the filters of measurements of some machines, whose filters of inputs go on."""
         if self.gaps is not None and machines.any():
-            at = machines[:, None] & self.gaps.of_measurements
+            at = machines[:, None] & self.gaps.bank.of_measurements
             np.copyto(self.x, self.observer.initial(y, self.values, u), where=at)
             self.gaps.start[machines] = OLDEST
 

@@ -228,6 +228,6 @@ class ObserverData:
         for name, value in given.items() if shape is not None else ():
             if (found := value.shape) not in ((), shape, (1,) * len(shape or ())):
                 raise DimensionError(
-                    f"Running observer {self.name}: the parameter {name!r} should have shape {shape}, found {found}."
+                    f"Running observer {self.name}: {name!r} should have shape {shape}, found {found}."
                 )
         return values

@@ -142,10 +142,7 @@ def read_observer(path: Path) -> ObserverData:
     """Read an observer's file."""
     content = read_json(path)
     if not isinstance(content, dict) or content.get("kind") != KIND or content.get("schema") != SCHEMA:
-        raise DataError(
-            f"Loading an observer from {path}: not an observer file of schema {SCHEMA}; write it again with this "
-            "version of kros."
-        )
+        raise DataError(f"Loading an observer from {path}: not an observer file of schema {SCHEMA}; write it again.")
     if not check_checksum(content, path):
         log.warning("The observer of %s carries no checksum: it was edited.", path)
     with as_written("Observer", path):
@@ -164,16 +161,14 @@ def _checked(content: ByName, where: str) -> ObserverData:
 def _observer(file: Any) -> ObserverData:
     names = [*file.states, *file.inputs, *file.parameters]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise DataError(
-            f"the names of states, inputs and parameters should differ, found {', '.join(twice)} more than once."
-        )
+        raise DataError(f"the names of states, inputs and parameters should differ, found {', '.join(twice)} again.")
     lifting = Lifting(
         file.states, file.lifting, tuple(file.parameters), file.lifting_inputs, file.input_functions, file.sizes
     )
     measured, order, K = file.measured, len(file.controller.A), file.controller
     if len(set(measured)) < len(measured) or not set(measured) <= set(range(lifting.n_states)):
         raise DataError(
-            f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {list(measured)}."
+            f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {measured}."
         )
     columns = ((K.A, order), (K.B, len(measured)), (K.C, order), (K.D, len(measured)))
     A, B, C, D = (np.reshape(matrix, (len(matrix), width)) for matrix, width in columns)

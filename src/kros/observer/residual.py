@@ -108,9 +108,7 @@ def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], 
         np.array([csd(one[None], one[:, None], **options)[1][..., : size // 2 + 1] for one in x]), -1, 1
     )
     if not np.isfinite(total).all():
-        raise DataError(
-            "Residual spectra: the residual contains NaN or infinity; look at the recordings and the nominal model."
-        )
+        raise DataError("Residual spectra: a residual is not finite; look at the recordings and the nominal model.")
     member = np.array([[u == name for u in units] for name in dict.fromkeys(units)])
     counts = member * (lengths // (size // 2) - 1)  # segments
     return np.einsum("ub,bfij->ufij", counts / counts.sum(axis=1, keepdims=True), total)
@@ -138,10 +136,7 @@ def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
     counted[:, np.arange(regressors.shape[1]) % _THIN != 0] = False
     regressors, following = regressors[counted], np.swapaxes(batch.states[h + 1 :], 0, 1)[counted]
     if len(regressors) < regressors.shape[1]:
-        raise DataError(
-            f"One-step rows: {regressors.shape[1]} coefficients need as many steps, found {len(regressors)}; record "
-            "more."
-        )
+        raise DataError(f"One-step rows: {regressors.shape[1]} coefficients, but {len(regressors)} steps; record more.")
     W = least_squares(regressors, following).T
     return W[:, : lifting.n_lifted], W[:, lifting.n_lifted :]
 

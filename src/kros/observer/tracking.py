@@ -42,14 +42,12 @@ class PhaseLockedLoop:
         of_inputs = any(name in formula.used for formula in lifting.input_formulas)
         if name not in lifting.parameters or lifting.history or of_inputs or observer.runtime.delay:
             raise ConfigError(
-                f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter "
-                f"{name!r} and measurements without delay, found parameters {lifting.parameters}, a history of "
-                f"{lifting.history} and a delay of {observer.runtime.delay}."
+                f"Phase-locked loop of {observer.name}: needs functions of present states with the parameter {name!r} and "
+                f"no delay, found {lifting.parameters}, a history of {lifting.history}, a delay of {observer.runtime.delay}."
             )
         if not settle_s > 0:
             raise ConfigError(
-                f"Phase-locked loop of observer {observer.name}: the time to settle should be positive, found "
-                f"{settle_s:g} s."
+                f"Phase-locked loop of {observer.name}: settle_s should be positive, found {settle_s:g} s."
             )
         n = lifting.n_states
         self.observer, self.name, self.forget = observer, name, min(observer.sample_period_s / settle_s, 1.0)

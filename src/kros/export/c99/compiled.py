@@ -111,8 +111,7 @@ class CompiledObserver:
         y, u = np.ascontiguousarray(y, dtype=float), np.ascontiguousarray(u, dtype=float)
         if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or (y.shape[1], u.shape[1]) != (self._q, self._m):
             raise DimensionError(
-                f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and "
-                f"{u.shape}."
+                f"Compiled observer: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and {u.shape}."
             )
         machine = self.start(y[0], parameters) if machine is None else machine
         x_hat, status = np.empty((len(y), len(self.states))), np.empty(len(y), dtype=np.uint32)

@@ -86,8 +86,7 @@ class ExtendedKalman:
         d = min(self.runtime.delay, len(y) - 1)
         if self.lifting.history:
             raise DimensionError(
-                f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found "
-                f"{self.lifting.functions}."
+                f"Extended Kalman filter: a delay of {d} samples needs present values, found {self.lifting.functions}."
             )
         x = replace(self, runtime=replace(self.runtime, delay=0)).run_all(y[d:], u[: len(u) - d], values)
         late = np.empty((len(x), len(y), *x.shape[2:]))

@@ -85,8 +85,7 @@ class Moments:
         rows = [i for i, unit in enumerate(self.units) if unit not in without]
         if not rows:
             raise DataError(
-                f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more "
-                "units."
+                f"Learned estimator: no unit is left without {', '.join(sorted(without))}; record more units."
             )
         h, delays = len(self.estimated), self.settings.delays
         products = self.products[rows].sum(axis=0)

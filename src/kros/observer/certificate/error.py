@@ -145,8 +145,7 @@ class _Assembly:
         shapes = (scales.error.shape, scales.residual.shape, scales.noise.shape)
         if shapes != ((n,), (n,), (q,)):
             raise DimensionError(
-                f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found "
-                f"{', '.join(map(str, shapes))}."
+                f"Re-lift scales of {observer.name}: needs {n} errors, {n} residuals, {q} noises, found {shapes}."
             )
         self.observer, self.scales, self.n = observer, scales, n
         self.delay, self.order = observer.runtime.delay, observer.controller.n_states
@@ -247,10 +246,8 @@ def slope_box(
     unbounded = np.argwhere(~(np.isfinite(lower) & np.isfinite(upper)))
     if len(unbounded):
         i, j = unbounded[0]
-        raise UnboundedSlopeError(
-            f"the slope of {formulas[i].text!r} by {names[j]!r} has no bound"
-            + (f" in the box {dict(box)}" if box else "")
-            + (f", {where}" if (where := break_of(formulas[i].expression, ranges)) else "")
-            + "; give a box: the ranges of the states and inputs it depends on"
-        )
+        where = break_of(formulas[i].expression, ranges)
+        problem = f"the slope of {formulas[i].text!r} by {names[j]!r} has no bound in the box {dict(box or {})}"
+        remedy = "give a box: the ranges of the states and inputs it depends on"
+        raise UnboundedSlopeError(f"{problem}{where and f', {where}'}; {remedy}")
     return lower, upper

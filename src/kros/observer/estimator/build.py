@@ -142,8 +142,7 @@ def require_known(unbounded: Mapping[str, Sequence[str]], measured: Sequence[str
     others = [name for together in unbounded.values() for name in together]
     if wrong := [*(set(unbounded) - set(measured)), *(set(others) - set(inputs))]:
         raise ConfigError(
-            f"Estimator: unbounded should map measured states {list(measured)} to inputs that go on with them, of "
-            f"{list(inputs)}, found {sorted(wrong)}; correct the names."
+            f"Estimator: unbounded should map measured states {measured} to inputs of {inputs}, not {sorted(wrong)}."
         )
 
 

@@ -108,7 +108,9 @@ def residual_spectra(residual: Array, lengths: ArrayLike, units: Sequence[str], 
         np.array([csd(one[None], one[:, None], **options)[1][..., : size // 2 + 1] for one in x]), -1, 1
     )
     if not np.isfinite(total).all():
-        raise DataError("Residual spectra: a residual is not finite; look at the recordings and the nominal model.")
+        raise DataError(
+            "Residual spectra: a residual is NaN or infinity; look at the recordings and the nominal model."
+        )
     member = np.array([[u == name for u in units] for name in dict.fromkeys(units)])
     counts = member * (lengths // (size // 2) - 1)  # segments
     return np.einsum("ub,bfij->ufij", counts / counts.sum(axis=1, keepdims=True), total)

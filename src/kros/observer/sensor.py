@@ -62,7 +62,7 @@ def require_measured(sensor: Sensors, measured: Sequence[str]) -> None:
     delays = {name: sensor.get(name, Sensor()).delay_samples for name in measured}
     if len(set(delays.values())) > 1:
         raise ConfigError(
-            f"sensor: delay_samples should be equal for all measured states, found {delays}; hold early ones back."
+            f"sensor: delay_samples should be the same for all measured states, found {delays}; hold early ones back."
         )
 
 

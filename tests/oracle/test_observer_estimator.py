@@ -14,15 +14,16 @@ import kros
 from kros.core.errors import ConfigError
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
+from kros.evaluate.sensor import as_shown
 from kros.lifting import Lifting
-from kros.observer import EstimatorSettings, Observer, Recordings, identify_estimator, run_observer
+from kros.observer import EstimatorSettings, Observer, Recordings, Sensor, identify_estimator, run_observer
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.gaps import decay
 from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Moments, Readout, Whitening, condition_weights
-from kros.observer.estimator.rows import Design, interpolated
+from kros.observer.estimator.rows import Design, bridged
 from kros.observer.simulate import Course
 
 
@@ -359,14 +360,27 @@ def test_estimates_stay_inside_declared_limits():
             identify_estimator("motor", *parts, settings=wrong)
 
 
-def test_families_grow_and_a_measurement_that_never_arrives_is_refused():
+def test_families_grow_and_straight_lines_bridge_losses():
     recordings, _ = plant(units=2, episodes=1)
     sizes = [len(design(recordings, family).bank) for family in FAMILIES]
     assert sizes == sorted(set(sizes))
-    with pytest.raises(kros.core.errors.DataError, match="no sample of a measurement arrives"):
-        interpolated(np.full((10, 1), np.nan))
     line = np.arange(10.0)[:, None]
-    np.testing.assert_allclose(interpolated(np.where(line % 3 == 1, np.nan, line)), line)
+    lost = np.arange(10) % 3 == 1
+    np.testing.assert_allclose(bridged(np.where(lost[:, None], np.nan, line), lost), line)
+
+
+def test_declared_losses_do_not_change_what_is_learned():
+    population = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    sensor = {population.measured[0]: Sensor(dropout=0.3)}
+    parts = "motor", Lifting(population.states), (0,), population.inputs
+    observers = []
+    for declared in ({}, sensor):
+        recordings = Recordings.of(
+            list(population.keys()),
+            lambda key, own=declared: as_shown(EpisodeBatch.read(population, [key]), own, population.states),
+        )
+        observers.append(identify_estimator(*parts, recordings, 1e-3, settings=FEW).observer)
+    np.testing.assert_array_equal(observers[1].A, observers[0].A)
 
 
 def from_rest(places: list[float], seed: int) -> tuple[Recordings, dict]:

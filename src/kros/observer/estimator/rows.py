@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ...core import Array, DataError, Whole, frozen
+from ...core import Array, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
 from ...data import EpisodeBatch, EpisodeKey
 from .bank import Bank
@@ -104,17 +104,10 @@ class Recordings:
         return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
 
 
-def interpolated(y: Array) -> Array:
-    """Return measurements (n_samples, q) with straight lines over those that are missing."""
-    if np.isfinite(y).all():
-        return y
-    filled = y.copy()
-    for column in filled.T:
-        there = np.isfinite(column)
-        if not there.any():
-            raise DataError("Estimator: no sample of a measurement arrives in a training episode; leave it out.")
-        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
-    return filled
+def bridged(y: Array, lost: Flags) -> Array:
+    """Return measurements (n_samples, q) with straight lines over samples that are lost, (n_samples,)."""
+    there, every = np.flatnonzero(~lost), np.arange(len(y))
+    return np.stack([np.interp(every, there, column[there]) for column in y.T], axis=1)
 
 
 def spread(items: Sequence[T], count: int) -> list[T]:
@@ -225,17 +218,16 @@ class Design:
             triangles.add("elsewhere", root * elsewhere)
             if not self.channels.inputs_only:
                 lost = np.random.default_rng(settings.seed).random(len(y)) < 0.5
-                line = interpolated(np.where(lost[:, None], np.nan, y))
-                bridged = self.seen(self.signals(batch, line), at) - rows
-                triangles.add("errors", np.sqrt(settings.gap_share) * root * bridged)
+                changes = self.seen(self.signals(batch, bridged(y, lost)), at) - rows
+                triangles.add("errors", np.sqrt(settings.gap_share) * root * changes)
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
                 triangles.add("errors", root * (self.seen(self.signals(batch, y + bias), at) - rows))
             weight += weights.sum()
         return Sample(*(triangles.of(name) / np.sqrt(weight) for name in ("rows", "restarts", "elsewhere", "errors")))
 
     def measurements(self, batch: EpisodeBatch) -> Array:
-        """Return the measurements of an episode, (n_samples, q), with straight lines over missing ones."""
-        return interpolated(batch.measurements(self.channels.measured)[: batch.lengths[0], 0])
+        """Return the measurements of an episode, (n_samples, q), as if all arrived: losses have rows of their own."""
+        return batch.measurements(self.channels.measured, arrived=False)[: batch.lengths[0], 0]
 
     def signals(self, batch: EpisodeBatch, y: Array) -> Array:
         """Return the channels of an episode with measurements y, (n_samples, channels)."""

@@ -262,6 +262,14 @@ def test_a_proof_stops_at_the_norm(seed: int) -> None:
         assert proven(R, (A, system.B), system.C, np.zeros((2, 2)), factor * norm) == (factor >= 1.01)
 
 
+def test_nothing_is_proven_where_rounding_grows() -> None:
+    """Of a model of states that are multiples of one another: stable, and its powers overflow."""
+    A = np.array([[-387206.46247167, 387207.40067715], [-387206.02437448, 387206.96257989]])
+    system = ErrorSystem(A, np.zeros((2, 0)), np.eye(2), np.zeros((0, 2)), np.zeros((0, 2)), np.eye(2), 0.1)
+    assert system.frozen(np.zeros(0)).is_stable()
+    assert proven_gain(system) == np.inf
+
+
 def test_a_certificate_survives_saving(tmp_path) -> None:  # type: ignore[no-untyped-def]
     found = relift_certificate(scalar(0.5, 0.2), box={"x": (-1, 2)})
     found.save(tmp_path)

@@ -364,3 +364,13 @@ def test_what_is_guessed_or_not_recognised_is_reported(
         written(tmp_path, {name: [header, *rows]})
     found = discover(tmp_path, wanted).findings
     assert [text.endswith(end) for text, end in zip(found, findings, strict=True)] == [True] * len(findings)
+
+
+def test_the_period_is_that_of_the_rows_that_are_there(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    for unit in "ab":
+        k = np.flatnonzero(rng.random(1000) > 0.03)
+        rows = [f"{i * 0.02:.2f},{np.sin(i / 20):.6f},{np.cos(i / 20):.6f},{np.sin(i / 9):.6f}" for i in k]
+        (tmp_path / f"{unit}_1.csv").write_text("\n".join(["time,angle,speed,u", *rows]) + "\n", encoding="utf-8")
+    found = discover(tmp_path, Wanted(measured=("angle",), inputs=("u",)))
+    assert any("resampled to a period of 0.02 s;" in text for text in found.findings)

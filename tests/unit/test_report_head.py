@@ -73,6 +73,21 @@ BOUND = {"set_certified": True, "set_bound": {"velocity": 0.003}, "relift_certif
             "errors",
             "“linear, mixed H2-H∞” has smaller errors",
         ),
+        (
+            {
+                "evaluation": [row(NAME, 0.2), row("linear/residual_h2", 0.1)],
+                "observers": {NAME: {"loss_error_percent": 38.0}, "linear/residual_h2": {"loss_error_percent": None}},
+            },
+            Status.CHECK,
+            "errors",
+            "smaller errors in all hidden channels, but where measurements are lost it diverges (the deployed one: 38",
+        ),
+        (
+            {"evaluation": [row("koopman/open_loop", 0.9)], "study": {"deployed": "koopman/open_loop"}},
+            Status.NOT_READY,
+            "errors",
+            "no better than its model",
+        ),
         ({"evaluation": [row(NAME, None)]}, Status.NOT_READY, "models", "diverge"),
         (
             {"evaluation": [row(NAME, 0.9), row("koopman/open_loop", 0.9)]},

@@ -59,15 +59,17 @@ def gramian_root(A: AnyArray, B: AnyArray) -> AnyArray:
     """Return R with ``R R'`` the controllability Gramian of a stable discrete pair, shape (n, at most n).
 
     ``P = sum_k A^k B B' A'^k`` is summed by doubling on its factor, ``R_2k`` is the triangle of
-    ``[R_k, A^k R_k]``. Poles near one cost a few more doublings and no accuracy.
+    ``[R_k, A^k R_k]``. Poles near one cost a few more doublings and no accuracy. R is not finite where the rounding of
+    powers grows: the pair is too badly conditioned, as that of states which are multiples of one another.
     """
     power, R = A, qr_triangle(B.T).T
-    for _ in range(_MAX_ITERATIONS):
-        step = power @ R
-        R = qr_triangle(np.hstack([R, step]).T).T
-        if np.all(np.abs(step).max(axis=1, initial=0.0) <= EPS * np.abs(R).max(axis=1, initial=0.0)):
-            break
-        power = power @ power
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_MAX_ITERATIONS):
+            step = power @ R
+            R = qr_triangle(np.hstack([R, step]).T).T
+            if np.all(np.abs(step).max(axis=1, initial=0.0) <= EPS * np.abs(R).max(axis=1, initial=0.0)):
+                break
+            power = power @ power
     return R
 
 

@@ -29,6 +29,8 @@ class CheckRule:
     time: float = 1e-3  # largest deviation of one time step, in sampling periods
     period: float = 1e-4  # largest relative difference of the sampling periods of two episodes
     end: float = AGREED  # of a sample: how far rounding may move the end of an even grid
+    steps: int = 100  # of time at once, from which the sampling period is found
+    spread: tuple[float, float] = (0.05, 0.95)  # quantiles of steps between which they count as unevenness
     samples: int = 3  # fewest: two consecutive states and one more
     wild: float = 1e3  # times the size of a channel, from which on a sample is wild
     # to the median unit, from which on the size of a channel is doubted; half its logarithm beside the other channels

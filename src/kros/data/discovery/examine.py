@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import DataError, Work, frozen
+from ...core import Array, DataError, Work, frozen
 from ..population import EpisodeKey, Population
 from ..recording import (
     CHECK,
@@ -82,8 +82,7 @@ def _look(population: Population) -> list[EpisodeLook]:
             check_increasing(recording)
             period, deviation = population.sample_period_s, np.zeros(1)
             if time is not None and len(time) > 1:
-                far = min(100, len(time) // 2)  # steps at once: single ones may be rounded
-                period = float(np.median(time[far:] - time[:-far])) / far
+                period = typical_period(time)
                 deviation = np.abs(np.diff(time) / period - 1)
             usable_s = np.asarray(recording.usable(period).time_s)
             start, stop = longest_stretch(usable_s, GAP * period)
@@ -103,3 +102,14 @@ def _look(population: Population) -> list[EpisodeLook]:
         except DataError as error:
             looks[key] = EpisodeLook(key, str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())
+
+
+def typical_period(time: Array) -> float:
+    """Return the sampling period: of many steps at once, since single ones may be rounded, if no rows are lost in them.
+
+    Rounding and jitter make many steps as uneven as one; rows that are lost here and there add up.
+    """
+    far = min(CHECK.steps, len(time) // 2)
+    step, steps = np.diff(time), time[far:] - time[:-far]
+    uneven, together = (float(np.ptp(np.quantile(each, CHECK.spread))) for each in (step, steps))
+    return float(np.median(step)) if together > 2 * uneven else float(np.median(steps)) / far

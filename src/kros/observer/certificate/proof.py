@@ -192,7 +192,10 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
 
     (A, inputs), outputs, feed = system.multiplied(multipliers, gain)
     inputs, feed, n = inputs / gain, feed / gain, len(A)
-    T, back = reachable_coordinates(A, inputs, system.dt)
+    W = gramian(A, inputs, system.dt)
+    if not np.isfinite(W).all():
+        return None
+    T, back = coordinates(W)
     A, inputs, outputs = np.eye(n) + back @ (A - np.eye(n)) @ T, back @ inputs, outputs @ T
     room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), ITERATED) * (1 + ITERATED)) ** 2
     if room <= 0:
@@ -207,9 +210,8 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     return np.asarray(np.linalg.qr(R @ back, mode="r"))
 
 
-def reachable_coordinates(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
-    """Return T and its inverse, for coordinates in which a reachability Gramian is the identity."""
-    W = gramian(A, B, dt)
+def coordinates(W: Array) -> tuple[Array, Array]:
+    """Return T and its inverse, for coordinates in which a Gramian W is the identity."""
     size = np.sqrt(np.maximum(np.diag(W), 0.0))
     size[size == 0] = 1.0
     values, vectors = np.linalg.eigh(W / np.outer(size, size))

@@ -18,7 +18,7 @@ from ...data.prepare import with_gaps
 from ...data.recording import GroupWatch, check_population, digest_of, refuse_copies, title
 from ...evaluate.held_out import HeldOut
 from ...identify import ModelSet
-from ...identify.calibration import Values, training_keys, unit_parameters
+from ...identify.calibration import Values, unit_parameters
 from ...identify.factors import reduce_episodes
 from ...identify.identified import EpisodeFactors
 from ...identify.likeness import course, odd
@@ -148,14 +148,13 @@ def score_condition(
     same_unit: bool,
 ) -> Rows:
     """Score all units that were recorded in one condition."""
-    models, training, rows = recorded.models, training_keys(population), Rows()
+    models, rows = recorded.models, Rows()
     condition, halves = models.condition, recorded.halves()
     everything = {unit: keys for unit, c, keys in population.groups() if c == condition}
     tasks = [(population.select([u], [condition]), keys, models.lifting) for u, keys in everything.items()]
     motion = None if halves is None else outliers.motion_levels(*halves)
     for (unit, keys), factor in zip(everything.items(), executor.map(reduce_episodes, tasks), strict=True):
-        chosen = [keys.index(k) for k in training[unit, condition]]
-        evidence = Evidence.of(factor, models, values[unit]).part(chosen)
+        evidence = Evidence.of(factor, models, values[unit])
         known = recorded.same_recordings(factor)
         if unit in recorded.units and unit not in known and not same_unit:
             other = "the study has a unit of this name, with other recordings"
@@ -167,7 +166,7 @@ def score_condition(
         (response,) = recorded.response([evidence])
         level = None if recorded.same_motions(factor) else motion
         score = recorded.qualified(outliers.score(unit, response, known, level), evidence)
-        row = score_row(score, models, len(keys), float(factor.n_samples.sum()) * models.sample_period_s)
+        row = score_row(score, models, len(keys), evidence.n_samples * models.sample_period_s)
         rows.append(row | {"units": len(set(outliers.unit_ids) - known), "left_out": sorted(known)})
     return rows
 

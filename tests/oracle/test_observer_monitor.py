@@ -174,6 +174,8 @@ def test_the_bound_is_that_of_one_more_unit():
     over = prediction_bound(highest, 0.05) - highest.mean()
     assert abs(highest.mean() + np.sqrt(over**2 + wider)) < 1e-5  # levels are over the bound already
     assert monitor.units == 6
+    forgets_nothing = replace(observer, controller=gain(np.zeros((2, 1)), DT))
+    assert fit_monitor(forgets_nothing, training, settings).settle == len(r) // 4  # not whole short episodes
     loudest = records[max(found, key=found.get)]
     y, u = loudest[:, :1], loudest[:, 3:]
     shaken = y + 1e-2 * np.sin(100 * y)  # three short motions differ so much that the bound is wide

@@ -39,6 +39,7 @@ class MonitorSettings:
     beginning: int = 500  # samples that count as quiet in the beginning
     forgotten: float = 1e-3  # share of a start that may be left when innovations are judged
     settle: tuple[int, int] = (100, 1000)  # samples that are not judged after a start, at least and at most
+    unjudged: float = 0.25  # share of a training episode, of which no more is not judged
     shrink: float = 0.7  # of covariances to their diagonal
     quietest: float = 0.5  # least variance of a band, share of the median
     motions: int = 6  # of a unit; more of them add nothing to a bound
@@ -51,7 +52,8 @@ def fit_monitor(
     observer: Observer, training: TrainingSet, settings: MonitorSettings = DEFAULT, work: Work | None = None
 ) -> Monitor | None:
     """Return the monitor of an observer; None with fewer than three units."""
-    settle, rate = settling(observer, settings), settings.false_alarm_rate
+    length, rate = len(training.population.read(training.keys[0])), settings.false_alarm_rate
+    settle = min(settling(observer, settings), round(settings.unjudged * length))
     groups = dict(_groups(training, settings))
     runs = (work or Work()).run("monitor", [partial(_judged, observer, part, settle) for part in groups.values()])
     episodes = {group: run for group, run in zip(groups, runs, strict=True) if run}

@@ -75,12 +75,12 @@ def filters(run: RunFolder) -> Captioned:
 
 def _curves(run: RunFolder, name: str, observers: Sequence[str], freqs: AnyArray) -> list[Curve]:
     """Return responses with their label, colour and style."""
-    models = run.models[name]
-    curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY, "-")]
-    if name in run.uncertain:
-        weight = run.uncertain[name].weight
-        curves.append(("W left", weight.left.frequency_response(freqs), Tone.GOLD, "-"))
-        curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN, "--"))
+    models, weight = run.models[name], run.uncertain[name].weight
+    curves: list[Curve] = [
+        ("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY, "-"),
+        ("W left", weight.left.frequency_response(freqs), Tone.GOLD, "-"),
+        ("W right", weight.right.frequency_response(freqs), Tone.GREEN, "--"),
+    ]
     for observer in observers:
         K, look = scaled_filter(run.syntheses[observer], models), method_look(observer)
         curves.append((f"K {label_of(observer).text}", K.frequency_response(freqs), look.colour, look.style))

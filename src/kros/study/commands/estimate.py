@@ -47,10 +47,10 @@ def estimate_recordings(
                 counts[key.unit].update(status_counts(status))
     count = len(population.episodes)
     lines = [f"estimates of {count} episode{'s' * (count != 1)} in {out}"]
-    for unit in dict.fromkeys([*recordings.sources, *(unit for unit, of_unit in counts.items() if of_unit)]):
+    for unit in population.unit_ids:
         parts = [f"parameters {recordings.sources[unit]}"] if unit in recordings.sources else []
         parts += [f"{count} samples {bit}" for bit, count in counts[unit].items()]
-        lines.append(f"  unit {unit}: {'; '.join(parts)}")
+        lines += [f"  unit {unit}: {'; '.join(parts)}"] if parts else []
     return lines
 
 

@@ -23,7 +23,7 @@ def study_text(source: Path, data: ByName, discovery: Discovery | None, findings
     lines = [f"#:schema ./{SCHEMA}", *comment(written)]
     if findings:
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in comment(f"- {text}"))]
-    keys = {key: data[key] for key in ("source", "reader", "identify_on") if key in data}
+    keys = {key: data[key] for key in ("source", "reader", "identify_on") if data.get(key)}
     lines += ["", "[data]", *key_lines(keys), '# exclude = ["..."]  # units that take no part']
     lines += mapping_lines(discovery) if discovery is not None else []
     for step in data.get("prepare", ()):
@@ -45,21 +45,17 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
         raise ConfigError(f"Output {out}: exists; name another file, --out FILE, or remove it.")
     if not source.is_dir():
         raise DataError(f"Looking at {source}: there is no such folder; name the folder that holds the recordings.")
-    work = Work(progress=progress)
-    reader, discovery = detect_reader(source), None
-    if reader in ("parquet", "motor-drive-raw"):
-        if wanted != Wanted():
-            reason = f"these are {reader} recordings, which say what channels are"
-            raise ConfigError(f"Looking at {source}: {reason}; leave out --measured, --input, --files and --period.")
-        data: Record = {"source": _source(source, out), "reader": reader}
-    else:
+    work, reader, discovery = Work(progress=progress), detect_reader(source) or "csv", None
+    data: Record = {"source": _source(source, out), "reader": reader}
+    if reader == "csv":
         discovery = discover(source, wanted, work, fewest_samples())
-        data = {"source": _source(source, out), "reader": "csv", "csv": discovery.mapping}
-        data |= {"prepare": list(discovery.prepare)} if discovery.prepare else {}
+        data |= {"csv": discovery.mapping, "prepare": list(discovery.prepare)}
+    elif wanted != Wanted():
+        reason = f"these are {reader} recordings, which say what channels are"
+        raise ConfigError(f"Looking at {source}: {reason}; leave out --measured, --input, --files and --period.")
     folder = out.parent.absolute()
     population = open_source(validate_config({"data": dict(data)}, folder, str(out)))
-    condition = _condition(population)
-    data |= {"identify_on": condition} if condition else {}
+    data["identify_on"] = condition = _condition(population)
     findings = list(discovery.findings if discovery else ())
     try:
         check_population(population, allow_single=True)

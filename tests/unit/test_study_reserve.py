@@ -39,3 +39,6 @@ def test_a_reserve_without_a_bound_says_why() -> None:
     assert "needs 19" in bounds_of(rows({"a": 1.0}), rows({"c": 1.0}), ["velocity"], 0.95)["reason"]
     lost = rows({"a": float("inf"), "b": 1.0})
     assert "diverges on too many" in bounds_of(lost, rows({"c": 1.0}), ["velocity"], 0.6)["reason"]
+    one = rows({"b": 1.0})
+    assert "needs 2" in bounds_of(one, rows({"c": 1.0}), ["velocity"], 0.6)["reason"]
+    assert "cannot be calibrated" in bounds_of(one, rows({"c": 1.0}), ["velocity"], 0.6, lost=1)["reason"]

@@ -125,33 +125,30 @@ def next_unit(context: Context) -> Record:
     reserved, pooled = ([r for r in part if r["condition"] == home] for part in (rows, known))
     content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": confidence}
     content |= {"observer": deployed, "condition": home, "rows": rows, "failed": failed}
-    return content | bounds_of(reserved, pooled, hidden, confidence)
+    return content | bounds_of(reserved, pooled, hidden, confidence, len(failed))
 
 
 def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]:
-    """Return the errors on the units in reserve, infinite where one cannot be calibrated, and the reasons."""
+    """Return the errors on the units in reserve, and the reasons why some cannot be calibrated."""
     whole, facts = recordings_of(context.store.folder).select(context.facts.reserve), context.facts
     splits = split_episodes(whole, context.config.split.test).values()
     train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
-    facts = replace(facts, groups=dict.fromkeys(facts.reserve, ""), train=train, test=test, reserve=())
-    known, _, failed = unit_values(whole, context.calibration, facts.identify_on, facts=facts)
-    rows = Rows()
-    if keys := tuple(k for k in test if k.unit not in failed):
-        episodes = HeldOut(whole, keys, known, sensor=context.config.sensor, band_hz=band_hz(context))
-        (outcome,) = episodes.observers([context.deployed])
-        rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"))
-    lost = dict.fromkeys((k.unit, k.condition) for k in test if k.unit in failed)
-    base = {"observer": deployed, "role": "reserve"} | dict.fromkeys(_MEASURES, float("inf"))
-    return rows + [{**base, "unit": u, "condition": c, "channel": s} for u, c in lost for s in whole.states], failed
+    known, _, failed = unit_values(whole, context.calibration, facts.identify_on, facts=replace(facts, train=train))
+    keys = tuple(k for k in test if k.unit not in failed)
+    if not keys:
+        return Rows(), failed
+    episodes = HeldOut(whole, keys, known, sensor=context.config.sensor, band_hz=band_hz(context))
+    (outcome,) = episodes.observers([context.deployed])
+    return episodes.rows(deployed, outcome, dict.fromkeys(facts.reserve, "reserve")), failed
 
 
-def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> Record:
-    """Bound the next unit's errors in some channels, in percent and in RMS, all together."""
+def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float, lost: int = 0) -> Record:
+    """Bound the next unit's errors in some channels, in percent and in RMS, all together; lost units have no bound."""
     places = [(channel, measure) for channel in channels for measure in _MEASURES]
     errors, pooled = (
         np.array([[r[m] for r in of if r["channel"] == c] for c, m in places], float) for of in (rows, known)
     )
-    scale = pooled.mean(axis=1)
+    errors, scale = np.pad(errors, ((0, 0), (0, lost)), constant_values=np.inf), pooled.mean(axis=1)
     usable, units = np.isfinite(scale) & (scale > 0), errors.shape[1]
     bounds = next_unit_bound(errors[usable].T, scale[usable], confidence) if usable.any() else None
     if not usable.any():

@@ -52,15 +52,15 @@ def left_out(facts: Facts) -> Section | None:
         f"The units are divided into {folds} folds. For each fold the study is repeated with all other units, and its "
         "observers run on the units of the fold, as on new units. Certified: in how many folds."
     )
-    parts = [("made", "designed", ""), ("robust", "set of plants", "certified")]
-    parts.append(("relift_certified", "at run time", "certified"))
-    about, tables = [Column("observer"), *(Column(title, key, group) for key, title, group in parts)], []
+    about = [Column("observer"), Column("designed", "made"), Column("set of plants", "robust", "certified")]
+    about += [Column("at run time", "relift_certified", "certified")]
+    counts = {
+        name: {key: f"{n}/{folds}" for key, n in entry.items() if isinstance(n, int)}
+        for name, entry in folded["observers"].items()
+    }
+    tables = []
     for table in facts.tables_of(folded["rows"]):
-        rows = []
-        for name in table.cells:
-            entry = folded["observers"].get(name, {})
-            counts = {key: f"{entry[key]}/{folds}" for key, _, _ in parts if entry.get(key) is not None}
-            rows.append(_row(table, name) | counts)
+        rows = [_row(table, name) | counts.get(name, {}) for name in table.cells]
         caption = f"Units left out{in_condition(table.condition)}"
         tables.append(_table(caption, about, [table], rows, facts, sortable=True))
     return Section("left-out", "Units left out", [text], tables=tables)

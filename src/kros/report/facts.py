@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..core import ByName, Names, frozen, grouped
-from ..data import OUTLIERS, natural_key
+from ..data import natural_key
 from ..design.task import split_name
 from .names import number, observer_label, readable_unit, words
 
@@ -99,11 +99,6 @@ class Facts:
     def get(self, name: str) -> Any:
         """Return a part of the metrics, empty where it is absent."""
         return self.metrics.get(name, {})
-
-    @property
-    def set_aside(self) -> list[str]:
-        """Units that take no part in pooled results."""
-        return [row["unit"] for row in self.get("units") if row.get("group") == OUTLIERS]
 
     @property
     def study(self) -> ByName:

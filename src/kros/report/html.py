@@ -38,10 +38,9 @@ def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = 
     for drawn in figures.values():
         if drawn.reason:
             log.info("figure %s: left out, %s", drawn.name, drawn.reason)
-    aside = len(facts.set_aside)
-    count = f"{facts.study['units']} units" + (f" and {aside} set aside" if aside else "")
-    conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
-    name, subtitle = read_json(run / "study.json").get("name", run.name), " · ".join([count, *conditions])
+    conditions = filter(None, map(condition_label, facts.study["conditions"]))
+    subtitle = " · ".join([f"{facts.study['units']} units", *conditions])
+    name = read_json(run / "study.json").get("name", run.name)
     text = filled(name, subtitle, parts[0], evidence=parts[1], figures=figures, head=judge(facts))
     write_bytes(path, text.encode())
     return path

@@ -7,7 +7,7 @@ import platform
 from importlib import import_module
 
 from ...core.linalg import radius_text
-from ...data import some
+from ...data import OUTLIERS, some
 from ..content import Column, Row, Section, build
 from ..facts import Facts
 from ..names import in_condition, minus, model_label, number, words
@@ -24,7 +24,8 @@ def recordings(facts: Facts) -> Section:
     ]
     text = f"{study['units']} units, sampled every {study['sample_period_s']:g} s."
     text += f" Episodes: {'; '.join(counts)}." if counts else ""
-    text += f" Set aside as outliers: {some(facts.set_aside)}." if facts.set_aside else ""
+    aside = [row["unit"] for row in facts.get("units") if row.get("group") == OUTLIERS]
+    text += f" Set aside as outliers: {some(aside)}." if aside else ""
     text += f" Dropped for bad samples: {some(study['dropped'])}." if study.get("dropped") else ""
     channels, sensor = study.get("channels", {}), study.get("sensor", {})
     roles = dict.fromkeys(study.get("inputs", ()), "input") | dict.fromkeys(facts.measured, "measured")

@@ -57,7 +57,8 @@ def _row(row: ByName, errors: Sequence[ByName], scores: Sequence[ByName]) -> Row
     """Return what is known of a unit: errors by channel, scores by condition."""
     known = {(r["channel"], key): r.get(key) for r in errors for key in _ERRORS.values()}
     for r in scores:
-        score = {**r, "detectable": max(r.get("detectable", {}).values(), default=None)}
+        needed = r["needed_s"] if r.get("status") == "not enough data" else None
+        score = {**r, "detectable": max(r.get("detectable", {}).values(), default=None), "needed_s": needed}
         known |= {(r["condition"], key): score.get(key) for key in _OF_SCORES.values()}
     percent = [math.inf if r["error_percent"] is None else r["error_percent"] for r in errors]
     phase = row.get("phase_rad")

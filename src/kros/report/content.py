@@ -103,6 +103,6 @@ def _cell(value: Any, note: str, least: float | None) -> Cell:
         return Cell("yes" if value else "no", strong=not value, note=note)
     if isinstance(value, str) and value:
         return Cell(value, note=note)
-    size = None if value is None or value == "" else float(value)
+    size = float(value) if isinstance(value, int | float) else None
     text = str(value) if isinstance(value, int) else number(size)
     return Cell(text, strong=size is not None and size == least, note=note, value=size)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ...design.task import split_name
 from ..content import Column, Row, Section, Table, build
 from ..facts import ErrorTable, Facts
 from ..names import condition_label, in_condition, joined, label_of, number, observer_label, published, words
@@ -100,21 +99,16 @@ def _table(
 def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
     """Return the few observers that answer most questions, each with the roles it is compared in."""
     table, entries = facts.tables[0], facts.observers
-    channels = table.hidden
     designed = [n for n in table.cells if not label_of(n).baseline]
     certified = [n for n in designed if entries.get(n, {}).get("worst_case_h2") is not None]
     certified = certified or [n for n in designed if entries.get(n, {}).get("set_certified")]
-    tuned = [n for n in table.cells if split_name(n)[1] == "kalman_tuned"]
-
-    def best(names: Sequence[str]) -> str | None:
-        return min(names, key=lambda name: table.mean(name, channels), default=None)
-
     chosen = [
         ("deployed", facts.deployed),
-        ("best with a certificate", best(certified)),
+        ("best with a certificate", min(certified, key=lambda name: table.mean(name, table.hidden), default=None)),
         ("as published", next(iter(published(table.cells)), None)),
-        *(("", name) for name in (best(tuned), "learned", "filtered_difference", f"{facts.model}/open_loop")),
     ]
+    rivals = f"{facts.model}/kalman_tuned", "learned", "filtered_difference", f"{facts.model}/open_loop"
+    chosen += [("", name) for name in rivals]
     roles = dict[str, list[str]]()
     for role, name in chosen:
         if name in table.cells:

@@ -173,8 +173,7 @@ class Store:
         stored = [artefact for artefact in map(self.stored, digests) if artefact is not None]
         named = {digest for artefact in stored for digest in (artefact.digest, *artefact.results)}
         for path in self.artefacts.iterdir():
-            ours = len(path.stem) == sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
-            if ours and path.stem not in named:
+            if len(path.stem) == 2 * sha256().digest_size and path.stem not in named:
                 _remove(path)
 
 

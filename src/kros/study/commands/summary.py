@@ -19,30 +19,28 @@ from ..engine.store import METRICS
 from ..pipeline import RunResult
 
 _REQUIRED = ["numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "jinja2", "matplotlib"]
-_OPTIONAL = {
-    "distributed": "maps over units on a cluster (kros run --scheduler)",
-    "pandas": "reading long data frames",
-    "scikit-learn": "the estimator protocol",
-    "control": "exchange with python-control",
-    "fmpy": "checking exported FMUs",
+_PACKAGES = dict.fromkeys(_REQUIRED, "required") | {
+    "distributed": "optional, for maps over units on a cluster (kros run --scheduler)",
+    "pandas": "optional, for reading long data frames",
+    "scikit-learn": "optional, for the estimator protocol",
+    "control": "optional, for exchange with python-control",
+    "fmpy": "optional, for checking exported FMUs",
 }
 
 
 def diagnose() -> list[str]:
     """Return lines for people."""
-    system = f"Python {platform.python_version()} on {platform.platform(terse=True)}"
-    rows = [f"kros {_version('kros', 'not installed as a package')}   {system}"]
-    rows += [f"  {name:<16} {_version(name, 'MISSING: install kros again')}" for name in _REQUIRED]
-    rows += ["optional", *(f"  {name:<16} {_version(name, 'not installed')}   {of}" for name, of in _OPTIONAL.items())]
+    rows = [f"kros {_version('kros')}   Python {platform.python_version()} on {platform.platform(terse=True)}"]
+    rows += [f"  {name:<16} {_version(name):<14} {of}" for name, of in _PACKAGES.items()]
     compiler = next(filter(None, map(shutil.which, COMPILERS)), "none")
     return [*rows, f"C compiler        {compiler}   for batch runs, and for checking exported C code"]
 
 
-def _version(name: str, otherwise: str) -> str:
+def _version(name: str) -> str:
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
-        return otherwise
+        return "NOT INSTALLED"
 
 
 def ranking(facts: Facts) -> list[str]:

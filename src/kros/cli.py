@@ -406,10 +406,7 @@ def figures(run_folder: Run, out: Path) -> None:
 
 
 @app.command()
-def compare(
-    run_folders: Annotated[list[Path], _argument("RUN RUN...")],
-    quiet: Quiet = False,
-) -> None:
+def compare(run_folders: Annotated[list[Path], _argument("RUN RUN...")], quiet: Quiet = False) -> None:
     """Show in what runs differ: settings, recordings, errors, weights, certificates."""
     from .study.commands.summary import compare_runs
 

@@ -139,7 +139,7 @@ def test_single_precision_that_was_not_compared_is_a_warning(
     def gone(_):
         raise DataError("there are no recordings")
 
-    monkeypatch.setattr("kros.study.commands.export.open_source", gone)
+    monkeypatch.setattr("kros.study.engine.context.recordings_of", gone)
     result = kros("export", command, demo, tmp_path / "out.fmu", "--precision", precision)
     assert result.exit_code == 0, result.output
     assert ("there are no recordings" in caplog.text) == (command == "c")

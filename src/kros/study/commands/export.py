@@ -9,12 +9,11 @@ import numpy as np
 
 from ...core import ConfigError, KrosError, write_json
 from ...data.measures import identifier
-from ...evaluate.sensor import Arriving, arriving
+from ...evaluate.sensor import arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
 from ...loops.compiler import find_compiler
 from ...observer import Observer, recorded_factors, run_observer
 from ..engine.context import Context, open_finished
-from ..stages.learning import open_source
 from ..stages.load import TRIAL, angle_load
 from .field import load_observer
 
@@ -65,7 +64,9 @@ def exactness(folder: Path, observer: Observer, context: Context) -> str:
     if sample := compiled.selftest():
         raise ConfigError(f"Export: the self-test of {folder} fails at sample {sample}; do not use it, and report it.")
     try:
-        arrived = held_out_episode(observer, context)
+        population, parameters = context.population, context.identified.parameters
+        key = next(k for k in context.facts.test if k.unit in parameters)
+        arrived = arriving(observer, population, {key: population.read(key)[:LARGEST]}, parameters)
     except KrosError as error:
         log.warning("not compared with Python, since the run's recordings cannot be read: %s", error)
         return ""
@@ -79,14 +80,3 @@ def exactness(folder: Path, observer: Observer, context: Context) -> str:
     if not (apart <= TOO_COARSE).all():
         log.warning("single precision is too coarse for this observer; export it in double precision")
     return f"differs from Python on a held-out episode by at most {differences} of the largest estimate"
-
-
-def held_out_episode(observer: Observer, context: Context) -> Arriving:
-    """Return the first episode that no design knows, as far as code is compared on it."""
-    calibration = context.calibration
-    keys = [key for key in context.facts.test if calibration is None or key.unit in calibration.units]
-    if not keys:
-        raise ConfigError("no episode is held out.")
-    key, population = keys[0], open_source(context.config)
-    phase = {} if calibration is None else {calibration.spec.parameter: calibration.units[key.unit].phase_rad}
-    return arriving(observer, population, {key: population.read(key)[:LARGEST]}, {key.unit: phase})

@@ -28,9 +28,9 @@ def write_figures(run: Path, out: Path) -> list[str]:
     """Write every figure of a run as PNG and PDF to a folder; return the names of the files in their order."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
-    names = []
+    names, folder = [], RunFolder(run)  # what several figures show is read once
     for name in FIGURES:
-        drawn = draw(name, RunFolder(run))
+        drawn = draw(name, folder)
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)
             continue

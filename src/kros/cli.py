@@ -154,8 +154,8 @@ export = typer.Typer(help="Write an observer as C99 source or as an FMU.", no_ar
 app.add_typer(export, name="export")
 
 
-def _option(text: str, *names: str, metavar: str | None = None, **rest: Any) -> Any:
-    return typer.Option(*names, metavar=metavar, help=text, **rest)
+def _option(text: str, *names: str, **rest: Any) -> Any:
+    return typer.Option(*names, help=text, **rest)
 
 
 def _argument(metavar: str, text: str | None = None) -> Any:

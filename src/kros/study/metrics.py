@@ -110,7 +110,7 @@ def _uncertain_model(store: Store, name: str, model: UncertainModel) -> Record:
         "misfit_max": model.misfit_max,
         "weight": {"orders": orders, "cover_max": model.cover_max, "overbound_db_max": model.overbound_db_max},
     }
-    if store.holds("uncertainty", name, "noise"):
+    if store.holds("uncertainty", name, "noise", "noise_share.json"):
         facts, _ = load_artifact(store.path("uncertainty", name, "noise"), "noise_share")
         entry["noise_share"] = {key: facts[key] for key in ("median", "at_peak", "peak_hz")}
     return entry

@@ -74,9 +74,8 @@ class Store:
         return recorded_files(self.folder)
 
     def holds(self, *parts: str) -> bool:
-        """Tell whether a file, or any file in a folder, belongs to the run."""
-        name = "/".join(parts)
-        return any(f == name or f.startswith(f"{name}/") for f in self.files())
+        """Tell whether a file belongs to the run."""
+        return "/".join(parts) in self.files()
 
     def metrics(self) -> Record:
         """Return the metrics of the run."""
@@ -90,8 +89,8 @@ class Store:
         for stage, artefact in read_manifest(self.folder).items():
             for name in artefact.files if stage != Stage.REPORT else ():
                 if not artefact.matches(self.folder, name):
-                    reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
-                    raise DataError(f"Run: {self.path(name)} of stage {stage} {reason}; run the study again.")
+                    problem = f"{self.path(name)} of stage {stage} is missing, or was changed since"
+                    raise DataError(f"Run: {problem}; run the study again.")
 
     def stored(self, digest: str) -> Artefact | None:
         """Return an artefact that is in the store, whole."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -24,8 +23,6 @@ from ...observer.baselines.trained import Regressor
 from ...report.run_folder import Shown
 from ..engine.context import Context
 from .load import run_load
-
-log = logging.getLogger(__name__)
 
 
 def run(context: Context) -> None:
@@ -67,9 +64,6 @@ def judged(context: Context, episodes: HeldOut, roles: Mapping[str, str]) -> tup
     outcomes = dict(zip(names, chain.from_iterable(context.work.run("evaluate", work)), strict=True))
     outcomes = {name: outcomes[name] for name in (*context.observers_record["names"], *makers)}
     baselines = {name: outcomes[name].facts for name in makers}
-    for name, facts in baselines.items():
-        if facts.get("status") == "failed":
-            log.info("%s could not be computed: %s", name, facts["reason"])
     rows = [row for item in outcomes.items() for row in episodes.rows(*item, roles)]
     return outcomes, {"evaluation": rows, "baselines": baselines}
 

@@ -7,7 +7,6 @@ declared load is the truth for the other units as well: it is meant for loads th
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -27,7 +26,6 @@ from ...report.run_folder import Shown
 from ..config import LoadConfig
 from ..engine.context import Context
 
-log = logging.getLogger(__name__)
 LOAD = "load"
 
 
@@ -73,7 +71,6 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> Record:
             curves[name], fact = make()
         except KrosError as error:
             fact = {"status": "failed", "reason": str(error)}
-            log.info("%s could not be computed: %s", name, error)
         facts[name] = fact
     shown = next(i for i, key in enumerate(trial.test.keys) if key.condition == TRIAL.condition)
     key, estimates = trial.test.keys[shown], {n: values[:, [shown]] for n, values in curves.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,7 +19,6 @@ from .sections import EVIDENCE, FIRST
 from .theme import Tone
 from .verdict import judge
 
-log = logging.getLogger(__name__)
 _TEMPLATES = Path(__file__).parent / "templates"
 
 Mapped = Callable[[Callable[[str], Drawn], Iterable[str]], Iterator[Drawn]]
@@ -35,9 +33,6 @@ def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = 
     parts = [[s for make in makers if (s := make(facts)) is not None] for makers in (FIRST, EVIDENCE)]
     names = [section.figure for part in parts for section in part if section.figure]
     figures = {drawn.name: drawn for drawn in mapped(partial(encoded, RunFolder(run)), names)}
-    for drawn in figures.values():
-        if drawn.reason:
-            log.info("figure %s: left out, %s", drawn.name, drawn.reason)
     conditions = filter(None, map(condition_label, facts.study["conditions"]))
     subtitle = " · ".join([f"{facts.study['units']} units", *conditions])
     name = read_json(run / "study.json").get("name", run.name)

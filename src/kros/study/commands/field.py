@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import field, replace
@@ -36,7 +35,6 @@ from ..engine.store import DEPLOYED
 from ..stages.learning import ARRAYS
 from ..stages.load import LOAD
 
-log = logging.getLogger(__name__)
 # Episode, first sample, estimates and the tracked parameter, bits, what was recorded: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits, Array]
 _BLOCK = 20_000  # samples of an episode that are run at once

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -97,9 +96,6 @@ def open_finished(folder: Path, alone: bool = False) -> Iterator[Context]:
         yield Context(config, store, Work())
 
 
-log = logging.getLogger(__name__)
-
-
 @frozen
 class StageStep:
     """One stage: what it does, the sections or ``section.key`` it follows from, and which studies have it."""
@@ -139,7 +135,6 @@ def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str]) -
         store.path(METRICS).unlink(missing_ok=True)
         draft.commit(step.stage, digest, seconds, results.used)
     progress.finish(step.stage, seconds, skipped=False)
-    log.info("%s: %.2f s", step.stage, seconds)
 
 
 def _outdate(context: Context, digests: Mapping[Stage, str]) -> None:

@@ -66,7 +66,7 @@ class RunFolder:
     @cached_property
     def facts(self) -> RecordingFacts:
         """Groups of units, episodes for training and testing, condition of the models."""
-        return RecordingFacts.load(self._require("population/facts.json", "the recordings have not been read yet"))
+        return self._load("(population)/facts.json", RecordingFacts.load)["population"]
 
     @cached_property
     def channels(self) -> Channels:
@@ -92,12 +92,12 @@ class RunFolder:
     @cached_property
     def calibration(self) -> PhaseCalibration:
         """The phase calibration."""
-        return PhaseCalibration.load(self._require("calibration/calibration.json", "there is no phase calibration"))
+        return self._load("(calibration)/calibration.json", PhaseCalibration.load)["calibration"]
 
     @cached_property
     def models(self) -> dict[str, ModelSet]:
         """Models of the condition that feeds synthesis, of EDMD too where they are the start of refined ones."""
-        return self._load("models/([^/@]+)/model.json", ModelSet.load, "no models have been identified yet")
+        return self._load("models/([^/@]+)/model.json", ModelSet.load)
 
     @property
     def kinds(self) -> Names:
@@ -107,33 +107,29 @@ class RunFolder:
     @cached_property
     def uncertain(self) -> dict[str, UncertainModel]:
         """Uncertain models of the condition that feeds synthesis."""
-        reason = "the uncertainty has not been quantified yet"
-        return self._load("uncertainty/([^/@]+)/[^/]+.json", UncertainModel.load, reason)
+        return self._load("uncertainty/([^/@]+)/[^/]+.json", UncertainModel.load)
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
         """Residuals of all units relative to the weights, by kind of model."""
-        reason = "there are no residuals of single units"
-        return self._load("uncertainty/([^/@]+)/units/[^/]+.json", UnitResiduals.load, reason)
+        return self._load("uncertainty/([^/@]+)/units/[^/]+.json", UnitResiduals.load)
 
     @cached_property
     def others(self) -> dict[str, UnitResiduals]:
         """Residuals of the highest-scoring unit and of all others in its condition, by kind of model."""
-        reason = "no unit was compared with the others; at least three units in a condition are needed"
-        residuals = self._load("outliers/([^/]+)/others/[^/]+.json", UnitResiduals.load, reason)
+        residuals = self._load("outliers/([^/]+)/others/[^/]+.json", UnitResiduals.load)
         return {name.partition("@")[0]: one for name, one in residuals.items()}
 
     @cached_property
     def outlier_models(self) -> dict[str, OutlierModel]:
         """Outlier scores by condition."""
-        reason = "outlier scores need at least three units in a condition"
-        models = self._load("outliers/([^/]+)/outlier_model.json", OutlierModel.load, reason)
+        models = self._load("outliers/([^/]+)/outlier_model.json", OutlierModel.load)
         return {unquote(name.partition("@")[2]) or self.facts.identify_on: one for name, one in models.items()}
 
     @cached_property
     def syntheses(self) -> dict[str, Synthesis]:
         """Correction filters by ``model/method``."""
-        return self._load("synthesis/(.+)/synthesis.json", Synthesis.load, "no observer has been synthesized yet")
+        return self._load("synthesis/(.+)/synthesis.json", Synthesis.load)
 
     @property
     def nominal(self) -> str | None:
@@ -153,23 +149,17 @@ class RunFolder:
     @cached_property
     def shown(self) -> list[Shown]:
         """Episodes with estimates: nominal unit, worst off-nominal unit, and the nominal unit in other conditions."""
-        reason = "the observers have not been evaluated yet"
-        return list(self._load("evaluation/shown/([^/]+)/shown.json", Shown.load, reason).values())
+        return list(self._load("evaluation/shown/([^/]+)/shown.json", Shown.load).values())
 
     def _record(self, name: str) -> Record:
         """Return the content of an artifact; nothing where the run does not have it."""
         path = self.folder / name
         return load_artifact(path.parent, path.stem)[0] if self.has(name) else {}
 
-    def _load(self, pattern: str, load: Callable[[Path], T], reason: str) -> dict[str, T]:
+    def _load(self, pattern: str, load: Callable[[Path], T]) -> dict[str, T]:
         """Load the folders of all files that match a regular expression, by its group, those of linear models first."""
         matches = [match for name in sorted(self.files) if (match := re.fullmatch(pattern, name))]
         if not matches:
-            raise NotShownError(reason)
+            folder = pattern.partition("/")[0].strip("()")
+            raise NotShownError(f"there is nothing to show in the folder {folder} of this run")
         return linear_first({match[1]: load((self.folder / match[0]).parent) for match in matches})
-
-    def _require(self, name: str, reason: str) -> Path:
-        """Return the folder of a file, or raise with the reason why it is not there."""
-        if not self.has(name):
-            raise NotShownError(reason)
-        return (self.folder / name).parent

@@ -28,7 +28,7 @@ def errors(facts: Facts) -> Section | None:
     rows = [_row(table, name) | {"note": name} for table in tables for name in table.cells]
     whole = _table(caption, [*about, Column("condition")], tables, rows, facts, folded=True, sortable=True)
     more = [_TRUE] if any("true_rms" in r for r in facts.get("evaluation")) else []
-    return Section("errors", "Errors", [" ".join([_TEXT, *more])], tables=[first, whole], figure="observers_in_time")
+    return Section("errors", "Errors", [_TEXT, *more], tables=[first, whole], figure="observers_in_time")
 
 
 def other_conditions(facts: Facts) -> Section | None:

@@ -91,8 +91,8 @@ def spread(facts: Facts) -> Section | None:
         f"“{words(first['form'])}”. Below 0 dB a unit differs by less than the whole signal."
     )
     rows = list[Row]()
-    for form in dict.fromkeys(form for entry in entries.values() for form in entry["peak_db"]):
-        peaks = {name: entry["peak_db"].get(form) for name, entry in entries.items()}
+    for form in first["peak_db"]:
+        peaks = {name: entry["peak_db"][form] for name, entry in entries.items()}
         rows.append({"form": words(form), "used": "used" if form == first["form"] else "", **peaks})
     columns = [Column("form", note="used"), *(Column(f"{model_label(name)} (dB)", name) for name in entries)]
     caption = "Peak residual, with the nominal unit that suits each form best"

@@ -48,7 +48,7 @@ def check_units(run: Path, data: Path, workers: int, same_unit: bool) -> Rows:
 def verdicts(context: Context, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:
     """Do the same in a run that is open."""
     rows = scored(context, data, workers, same_unit)
-    return [with_verdict(plain(row)) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
+    return [with_verdict(plain(row)) for row in sorted(rows, key=itemgetter("condition", "unit"))]
 
 
 def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:

@@ -30,8 +30,7 @@ class Lines(Progress):
 
     def __init__(self, every_s: float = 10.0) -> None:
         self._every_s, self._written = every_s, time.monotonic()
-        self._stage, self._done, self._began = "", 0, 0.0
-        self._total: int | None = None
+        self.start("", None)
 
     def start(self, stage: str, total: int | None) -> None:
         """Remember what runs."""

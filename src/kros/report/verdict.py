@@ -182,7 +182,9 @@ def _of_units(facts: Facts) -> Checks:
     }
     for status, action in actions.items():
         if few := [r for r in rows if r.get("status") == status]:
-            yield _inconclusive(few, rows), action, "units"
+            which = f"{len(few)} of {len(rows)} outlier scores are not conclusive: {units_text(few)}"
+            none = f"No outlier score is conclusive ({len(few)} of {len(rows)})"
+            yield f"{none if len(few) == len(rows) else which}.", action, "units"
     if remarks := [f"{r['unit']} ({r['status']})" for r in facts.get("units") if r.get("status", "ok") != "ok"]:
         yield f"Units with a remark: {some(remarks)}.", "Record all units in the same conditions.", "units"
     if unlike := units_of_large_errors(facts):
@@ -205,13 +207,6 @@ def units_of_large_errors(facts: Facts) -> list[str]:
                 error = f"{number(row['error_percent'])} % in {words(channel)}"
                 texts.append(f"{place} has {error}, {number(ratio, 2)} times their median")
     return texts
-
-
-def _inconclusive(rows: Sequence[ByName], every: Sequence[ByName]) -> str:
-    """Say how many scores decide nothing."""
-    if len(rows) == len(every):
-        return f"No outlier score is conclusive ({len(rows)} of {len(every)})."
-    return f"{len(rows)} of {len(every)} outlier scores are not conclusive: {units_text(rows)}."
 
 
 def _of_errors(facts: Facts) -> Checks:

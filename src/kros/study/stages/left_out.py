@@ -117,29 +117,23 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
 
 def next_unit(context: Context) -> Record:
     """Run the deployed observer on the units in reserve; return what their errors say about the next unit."""
-    confidence, facts, population = context.config.evaluate.confidence, context.facts, context.population
-    deployed, home = context.observers_record["deployed"], facts.identify_on
-    rows, failed = reserve_rows(context, deployed)
+    facts, deployed, test = context.facts, context.observers_record["deployed"], context.config.split.test
+    population, home = recordings_of(context.store.folder).select(facts.reserve), facts.identify_on
+    splits = split_episodes(population, test).values()
+    own = replace(facts, train=tuple(key for split in splits for key in split.train))
+    values, _, failed = unit_values(population, context.calibration, home, facts=own)
+    rows = Rows()
+    if keys := tuple(key for split in splits for key in split.test if key.unit not in failed):
+        episodes = HeldOut(population, keys, values, sensor=context.config.sensor, band_hz=band_hz(context))
+        (outcome,) = episodes.observers([context.deployed])
+        rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.reserve, "reserve"))
     known = [r for r in context.evaluation["evaluation"] if r["observer"] == deployed and r["unit"] in facts.pooled]
     hidden = [c for c in population.states if c not in population.measured] or list(population.states)
     reserved, pooled = ([r for r in part if r["condition"] == home] for part in (rows, known))
+    confidence = context.config.evaluate.confidence
     content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": confidence}
     content |= {"observer": deployed, "condition": home, "rows": rows, "failed": failed}
     return content | bounds_of(reserved, pooled, hidden, confidence, len(failed))
-
-
-def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]:
-    """Return the errors on the units in reserve, and the reasons why some cannot be calibrated."""
-    whole, facts = recordings_of(context.store.folder).select(context.facts.reserve), context.facts
-    splits = split_episodes(whole, context.config.split.test).values()
-    train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
-    known, _, failed = unit_values(whole, context.calibration, facts.identify_on, facts=replace(facts, train=train))
-    keys = tuple(k for k in test if k.unit not in failed)
-    if not keys:
-        return Rows(), failed
-    episodes = HeldOut(whole, keys, known, sensor=context.config.sensor, band_hz=band_hz(context))
-    (outcome,) = episodes.observers([context.deployed])
-    return episodes.rows(deployed, outcome, dict.fromkeys(facts.reserve, "reserve")), failed
 
 
 def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float, lost: int = 0) -> Record:

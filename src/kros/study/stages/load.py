@@ -130,9 +130,13 @@ class LoadTrial:
     def of(cls, context: Context) -> LoadTrial:
         """Read the recordings; refuse a study without a known load, or without other units to judge on."""
         facts, population, units = context.facts, context.population, context.identified.parameters
-        usable = [u for u in facts.pooled if u in units]
-        known, others = _known(context, usable)
-        free, loaded = facts.identify_on, TRIAL.condition
+        usable, free, loaded = [u for u in facts.pooled if u in units], facts.identify_on, TRIAL.condition
+        known = list(context.config.load.units)
+        known = known or [u for u in usable if facts.keys("train", u, loaded)][: TRIAL.known]
+        others = [u for u in usable if u not in known]
+        if not set(known) <= set(usable) or not known or not any(facts.keys("test", u, loaded) for u in others):
+            needs = f"needs units with a known load and others to judge on, both recorded in condition {loaded!r}"
+            raise ConfigError(f"Load: {needs}; known {some(known) or 'none'}, others {some(others) or 'none'}.")
         places = {free: usable, loaded: [*known, *(usable if free == loaded else ())]}
         train = [k for k in facts.train if k.unit in places.get(k.condition, ())]
         test = [k for k in facts.test if k.unit in others and k.condition in (free, loaded)]
@@ -152,18 +156,6 @@ class LoadTrial:
         accuracy = load_accuracy(estimate, self.truth[1], dt, TRIAL.judged_hz, round(TRIAL.settle_s / dt))
         errors = {"error_percent": accuracy.percent, "error_to_floor": accuracy.ratio}
         return {"observer": name, **vars(accuracy), **errors}
-
-
-def _known(context: Context, usable: list[str]) -> tuple[list[str], list[str]]:
-    """Return the units on which the load is known, and the others."""
-    facts, condition = context.facts, TRIAL.condition
-    loaded = [u for u in usable if facts.keys("train", u, condition)]
-    known = list(context.config.load.units) or loaded[: TRIAL.known]
-    others = [u for u in usable if u not in known]
-    if not set(known) <= set(usable) or not known or not any(facts.keys("test", u, condition) for u in others):
-        needs = f"needs units with a known load and others to judge on, both recorded in condition {condition!r}"
-        raise ConfigError(f"Load: {needs}; known {some(known) or 'none'}, others {some(others) or 'none'}.")
-    return known, others
 
 
 def _truth(context: Context, batch: EpisodeBatch) -> Array:

@@ -7,7 +7,6 @@ import logging
 import re
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from ..core import ConfigError, write_bytes
 from .canvas import Figure
@@ -17,7 +16,7 @@ from .theme import DRAWING, Tone, style
 
 log = logging.getLogger(__name__)
 
-_CHANGING = {"png": ["Software"], "pdf": ["CreationDate", "Creator", "Producer"]}  # what no file states
+_METADATA = {"svg": "Date Creator Format Type", "png": "Software", "pdf": "CreationDate Creator Producer"}  # left out
 _FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 _FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?DejaVu Sans'?(?:, [^;\"]*)?")
 _COORDINATES = re.compile(r'(?<= )(?:d|x|y|transform)="[^"]*"')
@@ -34,21 +33,15 @@ def write_figures(run: Path, out: Path) -> list[str]:
         if drawn.figure is None:
             log.warning("figure %s is left out: %s", drawn.name, drawn.reason)
             continue
-        for suffix in _CHANGING:
-            write_bytes(out / f"{drawn.name}.{suffix}", printed(drawn.figure, suffix))
+        for suffix in ("png", "pdf"):
+            write_bytes(out / f"{drawn.name}.{suffix}", _encode(drawn.figure, suffix))
             names.append(f"{drawn.name}.{suffix}")
     return names
 
 
-def printed(figure: Figure, kind: str) -> bytes:
-    """Return a figure as PNG or PDF, 200 dots an inch; the same content gives the same bytes."""
-    return _encode(figure, kind, dpi=DRAWING.dots_per_inch, metadata=dict.fromkeys(_CHANGING[kind]))
-
-
 def to_svg(figure: Figure, name: str, title: str) -> str:
     """Return a figure as an inline SVG element in the page's colours; `name` is the prefix of all identifiers."""
-    metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
-    text = _encode(figure, "svg", transparent=True, metadata=metadata).decode()
+    text = _encode(figure, "svg").decode()
     text = text[text.index("<svg") :]
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", text)
@@ -60,11 +53,13 @@ def to_svg(figure: Figure, name: str, title: str) -> str:
     return _COORDINATES.sub(lambda match: _BEYOND.sub("", match.group()), text).strip()
 
 
-def _encode(figure: Figure, kind: str, **options: Any) -> bytes:
-    buffer = io.BytesIO()
+def _encode(figure: Figure, kind: str) -> bytes:
+    """Return a figure as SVG, PNG or PDF; the same content gives the same bytes."""
+    buffer, unstated = io.BytesIO(), dict.fromkeys(_METADATA[kind].split())
     with style():
         if (engine := figure.get_layout_engine()) is not None:  # once: every file would lay it out again
             engine.execute(figure)
             figure.set_layout_engine(None)
-        figure.savefig(buffer, format=kind, **options)
+        dots = DRAWING.dots_per_inch
+        figure.savefig(buffer, format=kind, dpi=dots, transparent=kind == "svg", metadata=unstated)
     return buffer.getvalue()

@@ -127,19 +127,16 @@ class Store:
         if self.manifest.get(stage) != replace(artefact, results=()):
             self.drop(stage)
             write_manifest(self.folder, self.manifest | {stage: artefact})
-        for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
-            self._link(self.artefacts / artefact.digest / name, place(self.folder, name))
-
-    def _link(self, source: Path, target: Path) -> None:
-        """Put a file of an artefact into the run folder too: the same file where the file system can, else a copy."""
         beside = self.artefacts / f"{TEMPORARY}link"
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            link_or_copy(source, beside)
-            beside.replace(target)
-        except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            blocking = error.filename2 or error.filename
-            raise ConfigError(f"Run folder: {blocking} is in the place of a result; move it away.") from error
+        for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
+            target = place(self.folder, name)
+            try:  # the same file where the file system can, else a copy
+                target.parent.mkdir(parents=True, exist_ok=True)
+                link_or_copy(self.artefacts / artefact.digest / name, beside)
+                beside.replace(target)
+            except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+                blocking = error.filename2 or error.filename
+                raise ConfigError(f"Run folder: {blocking} is in the place of a result; move it away.") from error
 
     def drop(self, *stages: str) -> None:
         """Forget stages and their files in the run folder that are as written; artefacts stay."""

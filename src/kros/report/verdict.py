@@ -113,7 +113,9 @@ def _numbers(facts: Facts) -> list[Number]:
                 notes.append(f"in training {growth:.2f} times as large on units left out")
             notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %", *_elsewhere(facts, channel)]
             if error := known.get("true_error_percent"):
-                notes.append(f"against the true signal: {number(error)} %{_lag(known.get('true_lag_s'))}")
+                lag_s = known.get("true_lag_s", 0.0)
+                lag = f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}" if lag_s else ""
+                notes.append(f"against the true signal: {number(error)} %{lag}")
             numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
     if rows := facts.get("outliers"):
         flagged, open_ = sorted({r["unit"] for r in rows if r["outlier"]}), undecided(rows)
@@ -133,13 +135,6 @@ def _worst(facts: Facts, channel: str) -> tuple[str, float]:
     """Return the condition in which the deployed observer's error of a channel is largest, and the error."""
     known = [table for table in facts.tables if facts.deployed in table.cells]
     return max(((t.condition, t.mean(facts.deployed, [channel])) for t in known), key=itemgetter(1))
-
-
-def _lag(lag_s: float | None) -> str:
-    """Return how late a signal is, for a sentence."""
-    if lag_s is None:
-        return ""
-    return f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
 
 
 def _stopping(facts: Facts) -> Checks:

@@ -171,10 +171,8 @@ def validate_config(raw: Record, base: Path, origin: str = "study", overrides: S
 
 def study_schema() -> Record:
     """Return the JSON schema of a study file, with all preparation steps."""
-    schema, steps = (
-        StudyConfig.model_json_schema(),
-        {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()},
-    )
+    schema = StudyConfig.model_json_schema()
+    steps = {name: TypeAdapter(kind).json_schema() for name, kind in STEPS.items()}
     for name, step in steps.items():
         step["properties"]["step"] = {"const": name}
     schema["$defs"]["DataConfig"]["properties"]["prepare"]["items"] = {"oneOf": list(steps.values())}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...core import AnyArray, ConfigError, frozen
-from ...data import Channel, Role
+from ...data import Channel
 from ...evaluate import fit_percent
 from ...evaluate.errors import error_spectrum
 from ...evaluate.held_out import HeldOut
@@ -177,13 +177,6 @@ def label_rows(axes: Iterable[Axes], channels: Sequence[Channel]) -> None:
         lines = textwrap.wrap(words(channel.name), DRAWING.label, max_lines=2, placeholder="…")
         unit = readable_unit(channel.unit)
         row.set_ylabel("\n".join([*lines, f"({unit})" if unit else ""]).strip())
-
-
-def references(channels: Sequence[Channel]) -> dict[str, int]:
-    """Return for every state the input column that is its reference, by the name ``target_<state>``."""
-    inputs = [c.name for c in channels if c.role is Role.INPUT]
-    states = [c.name for c in channels if c.role is Role.STATE]
-    return {name: inputs.index(f"target_{name}") for name in states if f"target_{name}" in inputs}
 
 
 def window_of(shown: Shown) -> slice:

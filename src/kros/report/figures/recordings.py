@@ -13,7 +13,7 @@ from ..canvas import Captioned, Figure, grid, label_below, legend, logarithmic, 
 from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
-from .episodes import draw_line, label_rows, references
+from .episodes import draw_line, label_rows
 
 _RECORDED, _REFERENCE = Look(Tone.INK), Look(Tone.GOLD, weight=3, opacity=0.5)
 
@@ -40,15 +40,15 @@ def population_figure(population: Population, unit: str | None = None, condition
 
 def recorded_figure(channels: Sequence[Channel], episodes: Sequence[Shown]) -> Figure:
     """Draw states and inputs of episodes, a column each; an input that is the reference of a state is behind it."""
-    targets, names = references(channels), [channel.name for channel in channels]
-    n_states = episodes[0].states.shape[1]
-    rows = [k for k in range(len(names)) if k - n_states not in targets.values()]
+    names = [channel.name for channel in channels]
+    targets = {k: names.index(f"target_{name}") for k, name in enumerate(names) if f"target_{name}" in names}
+    rows = [k for k in range(len(names)) if k not in targets.values()]
     figure, axes = grid(len(rows), len(episodes), sharey="row", sharex="col")
     for column, episode in zip(axes.T, episodes, strict=True):
         values = np.hstack([episode.states, episode.inputs])
         for panel, k in zip(column, rows, strict=True):
-            if (target := targets.get(names[k])) is not None:
-                draw_line(panel, episode.time_s, episode.inputs[:, target], _REFERENCE, "reference")
+            if k in targets:
+                draw_line(panel, episode.time_s, values[:, targets[k]], _REFERENCE, "reference")
             draw_line(panel, episode.time_s, values[:, k], _RECORDED, "recorded")
         column[0].set_title(episode_title(episode.key))
     label_rows(axes[:, 0], [channels[k] for k in rows])

@@ -60,7 +60,7 @@ def facts_of(recordings: FieldRecordings) -> Record:
     columns = {c.name: recorded_channel(observer, c.name).unit for c in recordings.population.channels}
     for ending in ("hat", "band"):
         columns |= {f"{state}_{ending}": recorded_channel(observer, state).unit for state in observer.recorded}
-    columns |= {} if name is None else {name: "rad"}
+    columns |= {name: "rad"} if name else {}
     parameters = {u: {**recordings.values[u], "source": source} for u, source in recordings.sources.items()}
     about = {key: observer.about.get(key) for key in ("kros", "study")}
     return {"observer": observer.name, **about, "columns": columns, "parameters": parameters}

@@ -78,8 +78,8 @@ def _calibration(context: Context) -> Record:
     if (calibration := context.calibration) is None:
         return {}
     spec = calibration.spec
-    entry = {"ratio": spec.ratio, "angle": spec.angle, "parameter": spec.parameter, "lag_rad": calibration.lag_rad}
-    return {"calibration": entry}
+    about = {key: getattr(spec, key) for key in ("ratio", "angle", "parameter")}
+    return {"calibration": about | {"lag_rad": calibration.lag_rad}}
 
 
 def _models(context: Context) -> Record:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core import ByName, ConfigError, Executor, Progress, Record, Work, member, write_json
+from ..core import ByName, ConfigError, Progress, Record, Work, member, write_json
 from ..data import OUTLIERS, Population, Shown, detect_reader
 from ..identify.presets import resolve_lifting, resolve_phase
 from ..identify.survey import check_usable
@@ -142,7 +142,7 @@ def run(
     require_own(out, config)
     require_usable(config, until, given)
     with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
-        return run_in(store, config, until, executor, progress, given)
+        return run_in(store, config, until, Work(executor, progress or Progress()), given)
 
 
 def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: ByName) -> StudyConfig:
@@ -183,16 +183,9 @@ def require_usable(config: StudyConfig, until: Stage, population: Population | N
     left_out.parted([u.id for u in population.units if u.group != OUTLIERS], config.evaluate.folds)
 
 
-def run_in(
-    store: Store,
-    config: StudyConfig,
-    until: Stage,
-    executor: Executor,
-    progress: Progress | None = None,
-    given: Population | None = None,
-) -> RunResult:
+def run_in(store: Store, config: StudyConfig, until: Stage, work: Work, given: Population | None = None) -> RunResult:
     """Run a study in its run folder, which is open."""
-    context = Context(config, store, Work(executor, progress or Progress()), given)
+    context = Context(config, store, work, given)
     run_steps(context, STEPS, until)
     metrics = collect_metrics(context, until)
     write_json(store.path(METRICS), metrics)

@@ -27,17 +27,11 @@ def recordings(facts: Facts) -> Section:
     aside = [row["unit"] for row in facts.get("units") if row.get("group") == OUTLIERS]
     text += f" Set aside as outliers: {some(aside)}." if aside else ""
     text += f" Dropped for bad samples: {some(study['dropped'])}." if study.get("dropped") else ""
-    channels, sensor = study.get("channels", {}), study.get("sensor", {})
+    steps = study.get("resolution", {})
     roles = dict.fromkeys(study.get("inputs", ()), "input") | dict.fromkeys(facts.measured, "measured")
     rows = [
-        {
-            "channel": words(c),
-            "unit": unit or "–",
-            "role": roles.get(c, "estimated"),
-            "resolution": study.get("resolution", {}).get(c),
-            "declared sensor": ", ".join(f"{words(k)} {v:g}" for k, v in sensor.get(c, {}).items() if v),
-        }
-        for c, unit in channels.items()
+        {"channel": words(c), "unit": unit or "–", "role": roles.get(c, "estimated"), "resolution": steps.get(c)}
+        for c, unit in study.get("channels", {}).items()
     ]
     table = build("Channels", [Column(key) for key in rows[0]], rows) if rows else None
     return Section("recordings", "Recordings", [text], tables=[table], figure="signals")

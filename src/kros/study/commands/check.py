@@ -33,7 +33,6 @@ from ..engine.store import DEPLOYED
 from .field import FieldRecordings, check_channels, hidden_states, open_data, status_counts
 
 log = logging.getLogger(__name__)
-Judged = list[tuple[Array, Flags]]  # innovations, and which samples are judged
 
 
 def check_units(run: Path, data: Path, workers: int, same_unit: bool) -> Rows:
@@ -177,7 +176,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
     missing = [name for name in observer.recorded if name not in population.states]
     monitor, units = observer.monitor, observer.monitor.units if observer.monitor else 0
     for unit, condition, keys in population.groups():
-        counts, judged, samples = Counter[str](), Judged(), 0
+        counts, judged, samples = Counter[str](), list[tuple[Array, Flags]](), 0  # innovations, and where they count
         for arrived in map(recordings.arriving, keys):
             samples += len(arrived.y)
             counts.update(status_counts(screened(observer, arrived.y, arrived.u).status))

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...core import ByName, ConfigError, Progress, digest_of, whole_folder, write_json
+from ...core import ByName, ConfigError, Progress, Work, digest_of, whole_folder, write_json
 from ...data import write_parquet
 from ...data.readers.motor_drive_raw import write_raw
 from ...identify.presets import HARMONIC_DRIVE
@@ -52,4 +52,4 @@ def run_demo(out: Path, settings: ByName, workers: int, progress: Progress, over
                 simulate_to(draft.draft(_RECORDINGS), HARMONIC_DRIVE, "parquet", settings)
                 draft.commit(_STAGE, digest, time.perf_counter() - began)
         require_usable(config, Stage.REPORT)
-        return run_in(store, config, Stage.REPORT, executor, progress)
+        return run_in(store, config, Stage.REPORT, Work(executor, progress))

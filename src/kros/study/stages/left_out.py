@@ -38,7 +38,7 @@ Rows = list[Record]
 
 def wanted(config: StudyConfig) -> bool:
     """Tell whether a study leaves units out."""
-    return config.evaluate.folds > 0 or config.evaluate.reserve > 0
+    return bool(config.evaluate.folds or config.evaluate.reserve)
 
 
 def parted(units: Sequence[str], folds: int) -> list[list[str]]:

@@ -59,7 +59,7 @@ def test_a_declared_load_is_found_on_the_other_units_with_the_parameters_of_the_
     assert linear.lifting.states[3] == "load"
     assert linear.seen is not None
     assert (koopman.parameters, linear.parameters) == ({"phase": 0.5}, {})
-    run = SimpleNamespace(folder=tmp_path, evaluation=content, has=lambda name: (tmp_path / name).exists())
+    run = SimpleNamespace(folder=tmp_path, evaluation=content)
     assert "linear/load" in load_torque(run)[1]
 
 

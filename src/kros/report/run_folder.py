@@ -59,10 +59,6 @@ class RunFolder:
         """Names of all files that belong to the run, relative to its folder."""
         return recorded_files(self.folder)
 
-    def has(self, name: str) -> bool:
-        """Tell whether a file belongs to the run."""
-        return name in self.files
-
     @cached_property
     def facts(self) -> RecordingFacts:
         """Groups of units, episodes for training and testing, condition of the models."""
@@ -154,7 +150,7 @@ class RunFolder:
     def _record(self, name: str) -> Record:
         """Return the content of an artifact; nothing where the run does not have it."""
         path = self.folder / name
-        return load_artifact(path.parent, path.stem)[0] if self.has(name) else {}
+        return load_artifact(path.parent, path.stem)[0] if name in self.files else {}
 
     def _load(self, pattern: str, load: Callable[[Path], T]) -> dict[str, T]:
         """Load the folders of all files that match a regular expression, by its group, those of linear models first."""

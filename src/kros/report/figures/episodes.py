@@ -150,7 +150,7 @@ def _draw_state(row: Sequence[Axes], block: Block, i: int, window: slice) -> Non
     row[0].axvspan(*time_s[window][[0, -1]], color=Tone.GRID, lw=0, zorder=0.5)
     for values, look in block.lines.values():
         error = recorded - values[:, i].astype(float)
-        if np.isfinite(error).all() and np.abs(error[start:]).max() < DRAWING.diverged * np.ptp(recorded):
+        if np.abs(error).max() < DRAWING.diverged * np.ptp(recorded):
             draw_line(row[2], time_s[start:], error[start:], look)
             freqs, density = error_spectrum(error, shown.sample_period_s)
             row[3].plot(freqs[1:], density[1:], look.style, color=look.colour)
@@ -160,7 +160,7 @@ def _draw_state(row: Sequence[Axes], block: Block, i: int, window: slice) -> Non
 
 def _inside(values: AnyArray, recorded: AnyArray) -> AnyArray:
     """Return values; those outside the range of the recorded signal with a margin become NaN, which ends a line."""
-    room = max(float(np.ptp(recorded)), np.finfo(float).tiny) / 2
+    room = np.ptp(recorded) / 2
     return np.where((values >= recorded.min() - room) & (values <= recorded.max() + room), values, np.nan)
 
 

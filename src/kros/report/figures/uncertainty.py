@@ -105,7 +105,7 @@ def _draw_weights(row: Sequence[Axes], model: UncertainModel, names: Names = (()
 def in_gauge(cover: Cover, other: Cover) -> Cover:
     """Return a cover with the scale between left and right of another: equal means of right entries in dB."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = np.exp((np.log(other.right) - np.log(cover.right)).mean(axis=1, keepdims=True))
+        scale = np.exp(np.log(other.right / cover.right).mean(axis=1, keepdims=True))
     scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
     return Cover(cover.left / scale, cover.right * scale)
 

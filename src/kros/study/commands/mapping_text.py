@@ -9,7 +9,7 @@ from typing import Any
 
 from ...core import ByName, Record
 from ...data.discovery.discover import Discovery
-from ...data.discovery.roles import ColumnPart, TableColumn
+from ...data.discovery.roles import ColumnPart
 from ...data.readers.csv_folder import CsvMapping
 
 
@@ -31,13 +31,9 @@ def mapping_lines(discovery: Discovery) -> Iterator[str]:
             yield from comment(f"left out: column {column.reference!r} ({column.why})")
     by_name = {c.name: c for c in discovery.columns}
     for channel in discovery.mapping["channel"]:
-        yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))
-
-
-def _channel(table: ByName, column: TableColumn) -> Iterator[str]:
-    for key, value in table.items():
-        note = {"role": column.why, "measured": "available at run time", "scale": "to " + column.unit}.get(key, "")
-        yield _line(key, value, note)
+        column = by_name[channel["name"]]
+        notes = {"role": column.why, "measured": "available at run time", "scale": f"to {column.unit}"}
+        yield from ("", "[[data.csv.channel]]", *(_line(key, of, notes.get(key, "")) for key, of in channel.items()))
 
 
 def _line(key: str, value: Any, note: str) -> str:

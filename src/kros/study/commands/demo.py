@@ -38,7 +38,7 @@ def simulate_to(out: Path, plant: str, layout: str, settings: ByName) -> None:
 
 def run_demo(out: Path, settings: ByName, workers: int, progress: Progress, overrides: Sequence[str]) -> RunResult:
     """Simulate drives and run the study on them, all below one folder; what is there is not simulated again."""
-    out = Path(out).absolute()
+    out = out.absolute()
     data = {"source": str(out / _RECORDINGS), "reader": "parquet"}
     config = validate_config({"name": "demo", "data": data}, out, overrides=overrides)
     digest = digest_of(code_key(), settings)

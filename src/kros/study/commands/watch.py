@@ -104,6 +104,6 @@ def judged(
     with suppress(FileNotFoundError):
         if place == place_of(path, folder, out):
             recording = str(path.relative_to(folder)).encode(errors="backslashreplace").decode()
-            result = {"recording": recording, "verdict": verdict, "reason": reason, "rows": rows}
-            write_json(place, {"schema": 1, **result})
+            result = {"schema": 1, "recording": recording, "verdict": verdict, "reason": reason, "rows": rows}
+            write_json(place, result)
             yield f"{verdict:<9}  {recording}: {reason}"

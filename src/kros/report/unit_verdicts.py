@@ -66,8 +66,8 @@ def with_verdict(row: Record) -> Record:
 
 def _within(row: Record, factor: float = 1.0) -> bool:
     """Whether the error is at most a factor times its bound, where there is one."""
-    error = row.get("error") or {"ratio": 0.0}
-    return error["ratio"] is not None and error["ratio"] <= factor
+    ratio = row.get("error", {}).get("ratio", 0.0)
+    return ratio is not None and ratio <= factor
 
 
 def by_unit(rows: Sequence[Record]) -> dict[str, tuple[Verdict, list[str]]]:

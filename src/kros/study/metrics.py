@@ -23,11 +23,10 @@ def collect_metrics(context: Context, until: Stage) -> Record:
     timing = {str(stage): manifest[stage].seconds for stage in done if stage in manifest}
     timing["total"] = sum(timing.values())
     metrics = {"schema": 1, "study": _study(context, done), "timing_s": timing, "units": _units(context, done)}
-    for stage in done:
-        if stage is Stage.EVALUATE:
-            metrics |= _evaluation(context, metrics)
-        elif stage in _OF_STAGES:
-            metrics |= _OF_STAGES[stage](context)
+    for stage in (stage for stage in _OF_STAGES if stage in done):
+        metrics |= _OF_STAGES[stage](context)
+    if Stage.EVALUATE in done:
+        metrics |= _evaluation(context, metrics)
     return plain(metrics)
 
 

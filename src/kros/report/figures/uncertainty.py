@@ -71,16 +71,16 @@ def draw_forms(axes: Axes, model: UncertainModel) -> None:
 
 def weights(run: RunFolder) -> Captioned:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
-    chosen, parts = run.unit_residuals, list[str]()
+    chosen = run.unit_residuals
     figure, axes = grid(len(chosen), 3, sharex=True)
     for row, (name, residuals) in zip(axes, chosen.items(), strict=True):
         model = run.uncertain[name]
         _draw_weights(row, model, entry_names(model.form, run.models[name]))
         ratio_panel(row[2], residuals)
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
-        parts.append(f"{model_label(name)} {number(model.overbound_db_max)} dB")
     set_titles(axes[0], ("left weight", "right weight", "units relative to the weights"))
     text = "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free. "
+    parts = [f"{model_label(name)} {number(run.uncertain[name].overbound_db_max)} dB" for name in chosen]
     return figure, f"{text}Largest mean excess of a weight: {', '.join(parts)}. A unit at most 0 dB is bounded."
 
 

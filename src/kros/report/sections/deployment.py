@@ -58,8 +58,7 @@ def _interface(facts: Facts, entry: ByName) -> list[tuple[str, Sequence[str]]]:
     largest, dt, late = entry["largest"], facts.study["sample_period_s"], entry["delay_samples"]
 
     def named(names: Sequence[str]) -> str:
-        sizes = {n: f" up to {number(largest[n])}" if n in largest else "" for n in names}
-        return joined([facts.axis(n) + sizes[n] for n in names])
+        return joined([f"{facts.axis(n)} up to {number(largest[n])}" for n in names])
 
     hidden = [facts.axis(n) for n in entry["estimates"] if n not in entry["measured"]]
     delay = f"a measurement delay of {late} samples is assumed" if late else "no measurement delay is assumed"
@@ -100,6 +99,6 @@ def _monitor(entry: ByName | None) -> list[str]:
     """Say what status bit 8 means, and how often it is wrong."""
     if not entry:
         return []
-    text = f"Status bit 8: the innovation is outside the envelope of {entry['units']} units. A good unit leaves it "
-    text += f"with a probability of {100 * entry['false_alarm_rate']:g} %"
-    return [f"{text}."]
+    rate = f"{100 * entry['false_alarm_rate']:g} %"
+    text = f"Status bit 8: the innovation is outside the envelope of {entry['units']} units, that of a good unit"
+    return [f"{text} with a probability of {rate}."]

@@ -22,7 +22,7 @@ from ...core import (
     read_toml,
 )
 from ...core.linalg import pieces
-from ...data import EpisodeKey, Population, read
+from ...data import EpisodeKey, Population, read, some
 from ...data.prepare import with_gaps
 from ...evaluate.sensor import Arriving, arriving
 from ...identify.calibration import Texts, Values, unit_values
@@ -111,9 +111,8 @@ def parse_given(texts: Collection[str], units: Collection[str], known: Collectio
         except ValueError:
             value = np.nan
         if unit not in units or name not in known or not np.isfinite(value):
-            of = f"a unit of the recordings ({', '.join(sorted(units)[:5])})"
-            name_of = f"a parameter of the observer ({', '.join(known) or 'it has none'})"
-            raise ConfigError(f"--parameter {text}: should be UNIT.NAME=VALUE with {of}, {name_of} and a number.")
+            there = f"units are {some(sorted(units))}, parameters {', '.join(known) or 'none'}"
+            raise ConfigError(f"--parameter {text}: should be UNIT.NAME=VALUE with a number; {there}.")
         given.setdefault(unit, {})[name] = value
     return given
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from shutil import copyfile
 
 from ...core import ConfigError, DataError, Names, save_artifact
-from ...data import OUTLIERS, Population, read
+from ...data import OUTLIERS, Population, read, some
 from ...data.prepare import parse_steps, prepare
 from ...design.synthesize import synthesize_all
 from ...evaluate.over_units import draw_reserve
@@ -41,9 +41,8 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
         raise ConfigError("Study of arrays: they are not in the run folder; give the population to kros.run again.")
     else:
         population = read(data.source, data.reader, mapping=data.csv, prepare=data.prepare)
-    unknown = [unit for unit in data.exclude if unit not in population.unit_ids]
-    if unknown:
-        known = ", ".join(population.unit_ids)
+    if unknown := [unit for unit in data.exclude if unit not in population.unit_ids]:
+        known = some(population.unit_ids)
         raise ConfigError(f"data.exclude: the recordings have no unit {', '.join(unknown)}, only {known}.")
     return population.select([u for u in population.unit_ids if u not in data.exclude])
 

@@ -11,15 +11,13 @@ from ..config import Stage
 from ..engine.context import Context, open_finished
 from ..engine.executors import open_executor
 
-REPORT = "report.html"
-
 
 def run(context: Context) -> None:
     """Write report.html from the run folder and the metrics so far."""
     from ..metrics import collect_metrics
 
     metrics = collect_metrics(context, Stage.LEFT_OUT)
-    render(context.store.folder, metrics, partial(context.work.map, "report"), context.store.draft(REPORT))
+    render(context.store.folder, metrics, partial(context.work.map, "report"), context.store.draft("report.html"))
 
 
 def render_run(folder: Path, workers: int) -> Path:

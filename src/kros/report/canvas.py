@@ -59,8 +59,8 @@ def lines_of_units(axes: Axes, x: AnyArray, lines: AnyArray, colour: str, label:
     from matplotlib.collections import LineCollection
 
     paths = [np.column_stack([x, line]) for line in lines if np.isfinite(line).any()]
-    look: Record = {"linewidths": DRAWING.thin, "alpha": DRAWING.shade}
-    axes.add_collection(LineCollection(paths, colors=colour, label=label, **look))
+    thin = LineCollection(paths, colors=colour, linewidths=DRAWING.thin, alpha=DRAWING.shade, label=label)
+    axes.add_collection(thin)
     axes.autoscale_view()
 
 

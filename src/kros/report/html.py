@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,10 +21,8 @@ from .verdict import judge
 
 _TEMPLATES = Path(__file__).parent / "templates"
 
-Mapped = Callable[[Callable[[str], Drawn], Iterable[str]], Iterator[Drawn]]
 
-
-def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = None) -> Path:
+def render(run: Path, metrics: ByName, mapped: Callable[..., Iterable[Drawn]] = map, out: Path | None = None) -> Path:
     """Write the report of a run from ``metrics.json``, of which any part but ``study`` may be absent.
 
     `mapped` maps the drawing of a figure over their names, in order, for example in several processes.

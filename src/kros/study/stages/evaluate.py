@@ -51,8 +51,8 @@ def run(context: Context) -> None:
     for number, key in enumerate(episodes.shown):
         shown = [{n: single(o.shown[key]) for n, o in of.items() if key in o.shown} for of in (results, free_runs)]
         states, inputs = map(single, population.read_parts(key))
-        one = Shown(key, population.sample_period_s, states, inputs, *shown)
-        one.save(context.store.draft("evaluation", "shown", str(number)))
+        place = context.store.draft("evaluation", "shown", str(number))
+        Shown(key, population.sample_period_s, states, inputs, *shown).save(place)
 
 
 def judged(context: Context, episodes: HeldOut, roles: Mapping[str, str]) -> tuple[dict[str, Outcome], Record]:

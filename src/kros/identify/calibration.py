@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..core import Array, Flags, IdentificationError, Storable, Work, digest_of
+from ..core import Array, Flags, IdentificationError, Storable, Work
 from ..core.arrays import Texts as Texts
 from ..core.linalg import pieces
 from ..data import Population, split_episodes
@@ -204,7 +204,7 @@ Task = tuple[Population, Keys, PhaseSpec]
 def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work) -> PhaseCalibration:
     """Calibrate all units on training episodes; one that cannot be calibrated is left out, its reason in the log."""
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
-    recalled = work.recall("calibrate", segments_of, tasks, [_mark(facts, t) for t in tasks], list[Segment])
+    recalled = work.recall("calibrate", segments_of, tasks, map(facts.mark, tasks), list[Segment])
     units: dict[str, UnitPhase] = {}
     for unit, segments in zip(facts.groups, recalled, strict=True):
         try:
@@ -219,12 +219,6 @@ def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, wo
             f"{spec.reference!r} - {spec.measured!r})."
         )
     return resolve_branches(units, pooled, spec)
-
-
-def _mark(facts: RecordingFacts, task: Task) -> str:
-    """Return what the segments of a task follow from."""
-    population, keys, spec = task
-    return digest_of(population.columns, population.sample_period_s, spec, keys, facts.marks(keys))
 
 
 def segments_of(task: Task) -> list[Segment]:

@@ -18,7 +18,7 @@ the ranges of the lifted states and of the inputs as diagonal matrices X and U, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -59,9 +59,9 @@ class Factor:
         return Factor(self.R[rows], self.peak[rows], self.n_samples[rows])
 
     @classmethod
-    def stack(cls, factors: Sequence[Factor]) -> Factor:
-        """Stack factors along a new first axis."""
-        return cls(*(np.stack([getattr(f, name) for f in factors]) for name in vars(factors[0])))
+    def stack(cls, factors: Sequence[Factor], join: Callable[..., Any] = np.stack) -> Factor:
+        """Stack factors along a new first axis, or join them along the one that they have."""
+        return cls(*(join([getattr(f, name) for f in factors]) for name in vars(factors[0])))
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")

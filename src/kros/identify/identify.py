@@ -16,20 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, Flags, IdentificationError, Names, Record, Work, digest_of, frozen, require_kind
+from ..core import Array, ByName, Flags, IdentificationError, Names, Record, Work, frozen, require_kind
 from ..core.linalg import radius_text
 from ..data import Population
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
-from .factors import Factor, Ranges, Task, combine, lifted_factor, reduce_episodes, require_excitation
+from .factors import Factor, Ranges, combine, lifted_factor, reduce_episodes, require_excitation
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .refine import refine_population
 from .refine.metric import peak_residual
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
-from .survey import RecordingFacts, check_usable, survey
+from .survey import check_usable, survey
 
 log = logging.getLogger(__name__)
 
@@ -127,22 +127,14 @@ def _begin(
     population, facts, values = base.population, base.facts, base.parameters
     units = [u for u in facts.groups if u in values and facts.keys("train", u, condition)]
     tasks = [(population.select([u], [condition]), facts.keys("train", u, condition), base.lifting) for u in units]
-    marks = [_mark(facts, task) for task in tasks]
-    episodes = list(work.recall(f"identify ({condition})", reduce_episodes, tasks, marks, Factor))
+    episodes = list(work.recall(f"identify ({condition})", reduce_episodes, tasks, map(facts.mark, tasks), Factor))
     parameters = {name: np.array([values[u][name] for u in units]) for name in base.lifting.parameters}
     reduced = _Reduced(base, condition, tuple(units), Factor.stack([combine(f) for f in episodes]), parameters)
     longest_s = max(int(f.n_samples.max()) for f in episodes) * population.sample_period_s
     models = [replace(m, longest_s=longest_s) for m in reduced.identify(settings)]
     rows = tuple((k.unit, k.episode) for u in units for k in facts.keys("train", u, condition))
-    together = Factor(*(np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")))
     refining = reduced.begin_refinement(models, work) if settings.refine and reduced.feeds_synthesis else list
-    return EpisodeFactors(condition, rows, together), models, refining
-
-
-def _mark(facts: RecordingFacts, task: Task) -> str:
-    """Return what the factors of a task follow from: samples, channels, and the lifting without parameters' values."""
-    population, keys, lifting = task
-    return digest_of(facts.marks(keys), keys, population.channels, repr(lifting))
+    return EpisodeFactors(condition, rows, Factor.stack(episodes, np.concatenate)), models, refining
 
 
 @frozen

@@ -61,9 +61,11 @@ class RecordingFacts(Storable):
         parts = {part: grouped(getattr(self, part), lambda key: key.unit) for part in _PARTS}
         return {(part, unit): keys for part, of in parts.items() for unit, keys in of.items()}
 
-    def marks(self, keys: Iterable[EpisodeKey]) -> Names:
-        """Return the digests of some episodes."""
-        return tuple(self._digests[key] for key in keys)
+    def mark(self, task: tuple[Population, Sequence[EpisodeKey], Any]) -> str:
+        """Return a digest of what a result follows from: samples and channels of episodes, and how they are used."""
+        population, keys, how = task
+        samples = [self._digests[key] for key in keys]
+        return digest_of(samples, keys, population.columns, population.sample_period_s, repr(how))
 
     @cached_property
     def _digests(self) -> dict[EpisodeKey, str]:
@@ -174,7 +176,8 @@ def _facts(
     left, part = set(retained.episodes), [u for u in retained.unit_ids if u not in options.reserve]
     splits, groups = split_episodes(retained.select(part), options.test), {u: retained.unit(u).group for u in part}
     episodes = [e for group in read for e in group.episodes if e.key.unit in groups]
-    if short := [f"{title(e.key)} has {e.n_samples}" for e in episodes if e.n_samples < options.fewest]:
+    short = [f"{title(e.key)} has {e.n_samples}" for e in episodes if e.n_samples < options.fewest]
+    if short:
         raise DataError(f"Every episode needs at least {options.fewest} samples after preparation; {some(short)}.")
     train, test = (tuple(k for s in splits.values() for k in getattr(s, name)) for name in _PARTS)
     digests, measured = {e.key: e.digest for e in episodes}, retained.measured
@@ -195,15 +198,12 @@ def _facts(
 
 def _unlike(population: Population, read: Sequence[_GroupFacts], units: Collection[str]) -> list[str]:
     """Return what is said about units whose recordings are unlike those of most, in any condition."""
-    by_condition: dict[str, dict[str, list[_EpisodeFacts]]] = {}
-    for group in read:
-        if group.episodes and (key := group.episodes[0].key).unit in units:
-            by_condition.setdefault(key.condition, {})[key.unit] = group.episodes
     names, texts = [c.name for c in population.channels], list[str]()
-    for of in by_condition.values():
+    chosen = (group.episodes for group in read if group.episodes[0].key.unit in units)
+    for of in grouped(chosen, lambda episodes: episodes[0].key.condition).values():
         if len(of) > 2:
-            texts += unlike(names, {u: {title(e.key): e.moments for e in episodes} for u, episodes in of.items()})
-            texts += apart(names, {u: np.array([e.course for e in episodes]) for u, episodes in of.items()})
+            texts += unlike(names, {group[0].key.unit: {title(e.key): e.moments for e in group} for group in of})
+            texts += apart(names, {group[0].key.unit: np.array([e.course for e in group]) for group in of})
     return list(dict.fromkeys(texts))
 
 

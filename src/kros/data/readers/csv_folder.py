@@ -149,18 +149,9 @@ class CsvMapping(Dialect):
         columns = {c.name: {self.column(c, unit) for unit in self.units} for c in self.channel}
         return {name: Scaling(next(iter(of)) if len(of) == 1 else None) for name, of in columns.items()}
 
-    @property
-    def dialect(self) -> Dialect:
-        """How its files are written."""
-        return Dialect(**self.model_dump(include=set(Dialect.model_fields)))
-
     def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column:
         """Return where a channel of a unit is read from."""
         return unit.columns.get(channel.name, channel.name if channel.column is None else channel.column)
-
-    def without(self, names: Collection[str]) -> CsvMapping:
-        """Return the mapping without some channels."""
-        return self.model_copy(update={"channel": tuple(c for c in self.channel if c.name not in names)})
 
 
 def _is_mark(text: str) -> bool:
@@ -225,14 +216,15 @@ def read_csv_folder(
 ) -> Population:
     """Read a folder of CSV files; those that cannot be used are collected in `damaged`, with the reason, or refused."""
     chosen, source = load_mapping(mapping), Path(source)
-    dialect, places = chosen.dialect, dict[EpisodeKey, FilePlace]()
+    dialect = Dialect(**chosen.model_dump(include=set(Dialect.model_fields)))
+    places = dict[EpisodeKey, FilePlace]()
     groups, units_of_measure = Texts(), dict[Column, str]()
     for path, match in _matches(source, chosen):
         named = {name: text for name, text in match.groupdict().items() if text}
         try:
             table = Table.open(path, dialect, chosen.declared)
             if optional and not places:
-                chosen = chosen.without(_absent(chosen, table.fields, optional))
+                chosen = _present(chosen, table.fields, optional)
             episodes = list(_episodes(table, named, chosen, units_of_measure))
         except DataError as error:
             if damaged is None:
@@ -240,7 +232,7 @@ def read_csv_folder(
             damaged[match.string] = str(error)
             continue
         for key, place in episodes:
-            part = part_of(match.string, key)
+            part = f"{match.string}#{key.unit}/{key.condition}/{key.episode}"
             if place.rows != slice(None) and chosen.exclude and re.search(chosen.exclude, part):
                 continue
             if key in places:
@@ -253,11 +245,6 @@ def read_csv_folder(
     channels = tuple(Channel(c.name, c.role, c.unit, c.measured, c.truth_of) for c in chosen.ordered)
     facts = ([Unit(unit, group) for unit, group in groups.items()], chosen.sample_period_s, chosen.metadata)
     return assemble(recordings, channels, *facts, steps=chosen.steps, scaling=chosen.scaling)
-
-
-def part_of(path: str, key: EpisodeKey) -> str:
-    """Return how `exclude` knows an episode of a file that holds several."""
-    return f"{path}#{key.unit}/{key.condition}/{key.episode}"
 
 
 def _episodes(
@@ -276,12 +263,13 @@ def _episodes(
                 yield key, FilePlace(table, *place, rows, (i, mapping.pieces))
 
 
-def _absent(mapping: CsvMapping, fields: Names, optional: Collection[str]) -> set[str]:
-    """Return the channels that are not there and need not be: those that are optional, and truths."""
+def _present(mapping: CsvMapping, fields: Names, optional: Collection[str]) -> CsvMapping:
+    """Return the mapping without channels that are not there and need not be: those that are optional, and truths."""
     spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
     units = mapping.units
     absent = {c.name for c in spared for u in units if not _named(fields, mapping.column(c, u), c.column_unit)}
-    return absent | {c.name for c in mapping.channel if c.truth_of in absent}
+    channel = tuple(c for c in mapping.channel if not {c.name, c.truth_of} & absent)
+    return mapping.model_copy(update={"channel": channel})
 
 
 def csv_files(source: Path) -> dict[str, Path]:

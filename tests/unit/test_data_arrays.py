@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scans import scan_digests
 
 import kros
 from kros.core.errors import DataError
@@ -121,7 +122,7 @@ def test_frame_refuses() -> None:
         from_frame(frame(x="wide"), CHANNELS, time="t")
     disordered = np.arange(12)[[0, 1, 2, 3, 4, 6, 5, 7, 8, 9, 10, 11]] * 0.1
     with pytest.raises(DataError, match=r"time should increase, found 0\.6 s at sample 5 and 0\.5 s at sample 6"):
-        from_frame(frame(t=np.tile(disordered, 3)), CHANNELS, time="t")
+        scan_digests(from_frame(frame(t=np.tile(disordered, 3)), CHANNELS, time="t"))
     twice = pd.concat([frame(), frame()], axis=1)
     with pytest.raises(DataError, match="column 'x' occurs 2 times; the columns are"):
         from_frame(twice, CHANNELS, time="t")

@@ -74,13 +74,6 @@ def assemble(
     return prepare(Population(channels, period, known, episodes, source, *about), steps)
 
 
-def described(signals: Signals, steps: Iterable[Step]) -> Signals:
-    """Return signals as steps leave them."""
-    for step in steps:
-        signals = step.describe(signals)
-    return signals
-
-
 def _first_period(recordings: Recordings, episodes: Sequence[EpisodeKey]) -> tuple[float, EpisodeKey]:
     """Return the sampling period of the first episode whose beginning can be read, and this episode."""
     for key in episodes:
@@ -123,7 +116,9 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     [2.0, 8.0, 18.0]
     """
     added = tuple(steps)
-    signals = described(Signals(population.columns, population.sample_period_s, population.scaling), added)
+    signals = Signals(population.columns, population.sample_period_s, population.scaling)
+    for step in added:
+        signals = step.describe(signals)
     check_structure(signals.channels, population.episodes)
     columns, period, scaling = columns_in_order(signals.channels), signals.period_s, signals.scaling
     source = replace(population.source, steps=population.source.steps + added)

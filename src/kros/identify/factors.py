@@ -199,11 +199,6 @@ class Ranges:
         """Return factors of ``[Psi | Theta_plus]`` of channels divided by the ranges."""
         return R / np.concatenate([self.outputs, self.inputs, self.outputs])
 
-    def factor(self, factor: Factor) -> Factor:
-        """Return factors of channels divided by the ranges."""
-        peak = factor.peak / np.concatenate([self.outputs, self.inputs])
-        return Factor(self.triangles(factor.R), peak, factor.n_samples)
-
     def edmd(self, R: Array, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
         """Return EDMD models of recorded channels whose regularisation acts on channels divided by the ranges."""
         return self.restore(edmd(self.triangles(R), len(self.outputs), alpha))

@@ -29,9 +29,6 @@ class Stored(Mapping[str, T]):
     def __init__(self, load: Callable[[Path], T], places: Mapping[str, Path]) -> None:
         self._load, self._places, self._known = load, dict(places), dict[str, T]()
 
-    def __repr__(self) -> str:
-        return f"<Stored: {', '.join(self._places)}>"
-
     def __getitem__(self, name: str) -> T:
         if name not in self._known:
             self._known[name] = self._load(self._places[name])

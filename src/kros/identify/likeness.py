@@ -53,9 +53,8 @@ def apart(channels: Sequence[str], units: Mapping[str, Array]) -> list[str]:
 
     Units have the courses of their episodes, (episode, 4, c).
     """
-    lows, highs = (
-        np.array([end(of[:, row], axis=0) for of in units.values()]) for end, row in ((np.min, 2), (np.max, 3))
-    )
+    lows = np.array([of[:, 2].min(axis=0) for of in units.values()])
+    highs = np.array([of[:, 3].max(axis=0) for of in units.values()])
     low, high, found = np.median(lows, axis=0), np.median(highs, axis=0), list[str]()
     among = (lows <= high) & (highs >= low)  # what most units have
     for i, k in np.argwhere(~among & (2 * among.sum(axis=0) > len(lows)) & (high > low)):

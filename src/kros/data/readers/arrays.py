@@ -11,7 +11,7 @@ from ...core import Array, ByName, DataError, did_you_mean, frozen, grouped, sho
 from ...core.arrays import as_numbers
 from ..population import DEFAULT_CONDITION, Channel, Channels, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
-from ..recording import Recording, Recordings, check_increasing, check_period, check_structure, title
+from ..recording import Recording, Recordings, check_period, check_structure, title
 
 
 @frozen
@@ -122,12 +122,11 @@ def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
 
 def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> Array:
     """Return the samples of an episode, shape (n_samples, n_channels), columns as declared."""
-    names = [c.name for c in channels]
     if isinstance(episode, Mapping):
-        missing = next((name for name in names if name not in episode), None)
+        missing = next((c.name for c in channels if c.name not in episode), None)
         if missing is not None:
             raise DataError(f"{title(key)}: channel {missing!r} is missing, found {list(episode)}; correct the names.")
-        episode = tuple(episode[name] for name in names)
+        episode = tuple(episode[c.name] for c in channels)
     try:
         whole = not isinstance(episode, tuple)
         values = as_numbers(episode) if whole else np.column_stack([as_numbers(part) for part in episode])
@@ -172,7 +171,7 @@ def from_frame(
     Raises
     ------
     DataError
-        A missing column, ids that are not text or whole numbers, time that runs back or is uneven.
+        A missing column, ids that are not text or whole numbers; when episodes are read, time that is not even.
 
     Examples
     --------
@@ -198,10 +197,7 @@ def from_frame(
     keys = list(map(EpisodeKey, *ids))
     rows = grouped(range(len(keys)), keys.__getitem__)  # they need not stand together
     places = {key: (numbers[at], None if times is None else times[at]) for key, at in rows.items()}
-    recordings = ArrayRecordings(places)
-    for key in places:
-        check_increasing(recordings(key), " in the frame")
-    return assemble(recordings, ordered, sample_period_s=sample_period_s)
+    return assemble(ArrayRecordings(places), ordered, sample_period_s=sample_period_s)
 
 
 def _ids(frame: Any, column: str | None, default: str | None) -> list[str]:

@@ -35,12 +35,9 @@ class TrainingData:
     def divided_by(self, ranges: Ranges) -> TrainingData:
         """Return the data of channels divided by ranges."""
         sizes = ranges.sizes(self.lifting, self.population.inputs)
-        return replace(
-            self,
-            population=scale_population(self.population, sizes),
-            lifting=self.lifting.in_sizes(sizes),
-            factor=ranges.factor(self.factor),
-        )
+        factor = replace(self.factor, R=ranges.triangles(self.factor.R))
+        population, lifting = scale_population(self.population, sizes), self.lifting.in_sizes(sizes)
+        return replace(self, population=population, lifting=lifting, factor=factor)
 
 
 @frozen

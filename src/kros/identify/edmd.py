@@ -23,7 +23,6 @@ w : weights of the episodes, (unit, draw, episode)
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,8 +30,6 @@ import numpy as np
 
 from ..core import EPS, TINY, AnyArray, Array, ArrayLike, DataError, IdentificationError, StateSpace, frozen
 from ..core.linalg import qr_triangle, spectral_radius
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -165,7 +162,10 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
     grid = 10.0 ** np.arange(top, top - 2 - search.decades, -1 / search.per_decade)
     first = next((i for i, alpha in enumerate(grid) if not _all_stable(factors, alpha, margin)), None)
     if first is None:
-        return 0.0 if _stable_without(factors, margin) else float(grid[-1])
+        try:
+            return 0.0 if _all_stable(factors, 0.0, margin) else float(grid[-1])
+        except IdentificationError:  # a dependent column: some regularisation is needed, however small
+            return float(grid[-1])
     if first == 0:
         raise IdentificationError(f"EDMD: models stay unstable up to alpha = {grid[0]:.1e}, with a margin of {margin}.")
     low, high = np.log10(grid[first]), np.log10(grid[first - 1])
@@ -180,14 +180,6 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
 
 def _all_stable(factors: list[tuple[Array, int]], alpha: float, margin: float) -> bool:
     return all(bool((edmd(R, n, alpha).spectral_radius() < 1 - margin).all()) for R, n in factors)
-
-
-def _stable_without(factors: list[tuple[Array, int]], margin: float) -> bool:
-    try:
-        return _all_stable(factors, 0.0, margin)
-    except IdentificationError:  # a dependent column: some regularisation is needed, however small
-        log.info("some lifted data are rank deficient, so alpha = 0 is not an option")
-        return False
 
 
 @frozen

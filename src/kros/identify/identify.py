@@ -212,9 +212,7 @@ class _Reduced:
             if not any(peak_residual(m.A, m.B, search.points) > search.largest_residual for m in models):
                 times = float(factor)
                 break
-        note = (
-            "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
-        )
+        note = "%s: alpha = %.4g for channels over their ranges, %g times the smallest that stabilises every model"
         log.info(note, self.condition, times * edge, times)
         return times * edge
 

@@ -17,12 +17,7 @@ from ..core import Array, frozen
 from ..data import Channel, Role
 from .batch import POSITION, VELOCITY, Batch, UnitTruth
 
-CHANNELS = (
-    POSITION,
-    VELOCITY,
-    Channel("current", Role.STATE, "A"),
-    Channel("voltage", Role.INPUT, "V"),
-)
+CHANNELS = (POSITION, VELOCITY, Channel("current", Role.STATE, "A"), Channel("voltage", Role.INPUT, "V"))
 
 
 @frozen

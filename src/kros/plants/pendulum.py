@@ -44,11 +44,7 @@ class PendulumPopulation(Batch[PendulumTruth]):
     """
 
     plant, truth = PendulumTruth.plant, PendulumTruth
-    channels = (
-        POSITION,
-        VELOCITY,
-        Channel("torque", Role.INPUT, "1"),
-    )
+    channels = (POSITION, VELOCITY, Channel("torque", Role.INPUT, "1"))
     noise = (0.01,)  # of velocity, rad/s
     hold = (20, 120)  # shortest and longest stair of the input, in samples
     parameters = {"gravity": (20.0, 0.08), "damping": (0.8, 0.15), "gain": (6.0, 0.08)}  # noqa: RUF012

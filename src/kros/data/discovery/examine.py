@@ -9,15 +9,7 @@ import numpy as np
 
 from ...core import Array, DataError, Work, frozen
 from ..population import EpisodeKey, Population
-from ..recording import (
-    CHECK,
-    GroupWatch,
-    check_episode,
-    check_increasing,
-    copies_among,
-    digest_of,
-    usable,
-)
+from ..recording import CHECK, GroupWatch, check_episode, check_increasing, copies_among, digest_of, usable
 from ..steps import GAP, longest_stretch
 
 

@@ -331,9 +331,8 @@ def _conversion(table: Table, at: int, column: Column, declared: str, known: dic
     if not declared and (None in (ours, theirs) or ours == theirs):
         return 1.0, 0.0
     if not declared or ours is None or theirs is None or ours.si != theirs.si:
-        problem = (
-            f"column {column!r} is in {stated!r}, and {'declared' if declared else 'in another file'} in {usual!r}"
-        )
+        where = "declared" if declared else "in another file"
+        problem = f"column {column!r} is in {stated!r}, and {where} in {usual!r}"
         raise DataError(f"Reading {table.path}: {problem}; correct the file, or column_unit (time_scale).")
     return theirs.factor / ours.factor, (theirs.offset - ours.offset) / ours.factor
 

@@ -46,13 +46,7 @@ class Normal:
 
 
 def normal_equations(
-    V: Array,
-    T: Array,
-    lifting: Lifting,
-    parameters: Mapping[str, Array],
-    segments: Segments,
-    sigma: Array,
-    stride: int,
+    V: Array, T: Array, lifting: Lifting, parameters: Mapping[str, Array], segments: Segments, sigma: Array, stride: int
 ) -> Normal:
     """Run all segments with their unit's model; add up normal equations over sigma (n,), every `stride` steps."""
     n, h = lifting.n_states, segments.history

@@ -133,7 +133,7 @@ def test_frame_refuses() -> None:
 
 
 def test_names_that_are_alike_as_text_are_refused() -> None:
-    with pytest.raises(DataError, match=r"Duplicate episodes: episode 0 of unit 1 \(default\) occurs 2 times"):
+    with pytest.raises(DataError, match=r"Duplicate episodes: episode 0 of unit 1 \(default\);"):
         from_arrays({1: [values(0)], "1": [values(1)]}, CHANNELS, 0.1)
     assert from_arrays({1: [values(0)]}, CHANNELS, np.float32(0.5)).sample_period_s == 0.5
 

@@ -84,7 +84,7 @@ def test_empty_and_duplicate() -> None:
     good = population()
     with pytest.raises(DataError, match="population is empty"):
         check_population(replace(good, episodes=()))
-    with pytest.raises(DataError, match=r"Duplicate episodes: episode 0 of unit a \(default\) occurs 2 times"):
+    with pytest.raises(DataError, match=r"Duplicate episodes: episode 0 of unit a \(default\);"):
         check_population(replace(good, episodes=(*good.episodes, good.episodes[0])))
 
 

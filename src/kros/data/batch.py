@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from ..core import Array, DataError, Flags, Names, Record, Whole, frozen
 from .population import EpisodeKey, Keys, Population
-from .recording import some
+from .recording import repeated, some
 
 
 @frozen
@@ -67,7 +66,7 @@ class EpisodeBatch:
         """Read episodes, each cut to at most `max_samples`, with the lifting parameters that all units have."""
         if not keys:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
-        if twice := [str(key) for key, count in Counter(keys).items() if count > 1]:
+        if twice := repeated(keys):
             raise DataError(f"Reading a batch of episodes: {some(twice)} named more than once; name each once.")
         pairs = {key: population.read_with_truths(key) for key in keys}
         batch = cls.of(population, {key: values[:max_samples] for key, (values, _) in pairs.items()}, parameters)

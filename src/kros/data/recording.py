@@ -258,10 +258,14 @@ class GroupWatch:
 def check_names(kind: str, names: Iterable[Any]) -> None:
     """Refuse names that are empty, no text, or hold characters that no file and no table can show."""
     for name in names:
-        if not isinstance(name, str) or not name.strip():
-            raise DataError(f"The name of every {kind} should be text that is not empty, found {name!r}; name it.")
-        if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
-            raise DataError(f"The name of a {kind} should hold printable characters only, found {name!r}; rename it.")
+        is_text = isinstance(name, str) and name.strip()
+        if not is_text or any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
+            raise DataError(f"The name of a {kind} should be printable text, found {name!r}; rename it.")
+
+
+def repeated(items: Iterable[Any]) -> list[str]:
+    """Return what is there more than once, as text."""
+    return [str(item) for item, count in Counter(items).items() if count > 1]
 
 
 def check_period(period_s: Any, what: str) -> float:
@@ -279,8 +283,7 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
     check_names("channel", names)
     for kind in ("unit", "condition", "episode"):
         check_names(kind, dict.fromkeys(getattr(key, kind) for key in episodes))
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
+    if twice := repeated(names):
         raise DataError(f"Channel names should differ, found {twice} more than once in {names}; rename them.")
     states = [c.name for c in channels if c.role is Role.STATE]
     if not states:
@@ -292,9 +295,8 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
         raise DataError(f"A truth says with `of` which state it is the truth of, one of {states}, found {truths}.")
     if not episodes:
         raise DataError("The population is empty: no episode was found; check the source and the reader.")
-    ((key, count),) = Counter(episodes).most_common(1)
-    if count > 1:
-        raise DataError(f"Duplicate episodes: {key} occurs {count} times; rename or remove the copies.")
+    if twice := repeated(episodes):
+        raise DataError(f"Duplicate episodes: {some(twice)}; rename or remove the copies.")
 
 
 def check_population(population: Population, allow_single: bool = False) -> None:

@@ -110,7 +110,8 @@ def _width(rows: Sequence[Sequence[str]]) -> int:
 def _score(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, int]:
     """Return how many rows of equal width hold numbers, and how many numbers they hold, those with a point twice."""
     data = [r for r in rows if _is_data(r, decimal)]
-    same = [r for r in data if len(r) == _width(data)]
+    width = _width(data)
+    same = [r for r in data if len(r) == width]
     return len(same), sum(1 + (decimal in c) for r in same for c in r if _is_number(c, decimal))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -12,7 +12,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ..core import DataError, Names, Record, Storable, frozen, load_artifact, loader, save_artifact
-from ..data import Population, Shown
+from ..data import Population, Shown, read_parquet, write_parquet
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor
@@ -133,11 +133,9 @@ class IdentifiedModels(Shown):
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with the recordings, in the layout of a run folder."""
-        from ..data import write_parquet
-
         folder = Path(folder)
         write_parquet(self.population, folder / "recordings", converted=False)
-        save_artifact(folder / "population", "facts", {"recordings": "recordings", **self.facts.content()})
+        replace(self.facts, recordings="recordings").save(folder / "population")
         if self.calibration is not None:
             self.calibration.save(folder / "calibration")
         self.save_models(folder)
@@ -173,12 +171,9 @@ class IdentifiedModels(Shown):
 
 def recordings_of(folder: Path) -> Population:
     """Open the recordings of a run folder, or of a saved result."""
-    from ..data.readers.parquet import read_parquet
-
     return read_parquet(recordings_path(folder))
 
 
 def recordings_path(folder: Path) -> Path:
     """Return where the recordings of a run folder, or of a saved result, are."""
-    content, _ = load_artifact(folder / "population", "facts")
-    return folder / str(content["recordings"])  # an absolute path stays as it is
+    return folder / RecordingFacts.load(folder / "population").recordings  # an absolute path stays as it is

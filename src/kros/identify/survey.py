@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core import ITERATED, Array, DataError, Names, Record, Work, grouped
-from ..core.artifacts import Storable, digest_of, divided, file_digest
+from ..core import ITERATED, Array, DataError, Names, Work, grouped
+from ..core.artifacts import Storable, digest_of, file_digest
 from ..core.files import is_file, link_or_copy, stamp_of
 from ..data import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, scaling_of, split_episodes
 from ..data.population import Keys
@@ -44,6 +44,7 @@ class RecordingFacts(Storable):
     alerts: Names = ()  # what looks wrong in the recordings without making them unusable
     reserve: Names = ()
     digests: Names = ()  # of the samples of the training episodes, then of the test episodes
+    recordings: str = "recordings"  # where they are, seen from the folder of a run
 
     @cached_property
     def pooled(self) -> Names:
@@ -70,10 +71,6 @@ class RecordingFacts(Storable):
     @cached_property
     def _digests(self) -> dict[EpisodeKey, str]:
         return dict(zip((*self.train, *self.test), self.digests, strict=False))
-
-    def content(self) -> Record:
-        """Return the facts in JSON's types."""
-        return dict(divided(self)[0])
 
 
 _Task = tuple[Population, Path | None, str]  # a unit in a condition, where it is written, if anywhere, and on_nan

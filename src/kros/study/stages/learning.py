@@ -70,8 +70,8 @@ def run_read(context: Context) -> None:
     _, facts = survey(population, context.work, copy, test=test, fewest=fewest, **options)
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")
-    content = {"recordings": data.source if in_place else "recordings", **facts.content()}
-    save_artifact(store.draft("population"), "facts", content)
+    facts = replace(facts, recordings=str(data.source)) if in_place else facts
+    facts.save(store.draft("population"))
 
 
 def run_calibrate(context: Context) -> None:

@@ -85,7 +85,7 @@ def read(
     else:
         population = read_parquet(source) if chosen == "parquet" else read_motor_drive_raw(source)
     absent = set(optional) - set(population.states) - set(population.inputs)
-    return prepared(population, [step for s in steps if (step := s.without(absent) if absent else s) is not None])
+    return prepared(population, filter(None, (step.without(absent) for step in steps)))
 
 
 def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:

@@ -54,10 +54,9 @@ class Table:
     @classmethod
     def open(cls, path: Path, dialect: Dialect, wanted: Collection[str | int | None] = ()) -> Table:
         """Return the table of a file, of several the one that holds the wanted columns."""
-        if is_binary(path):
-            columns = columns_of(path, wanted)
-            return cls(path, dialect, tuple(columns), tuple(map(clean_unit, columns.values())))
-        fields, units = _columns(path, dialect)
+        fields, units = (
+            zip(*columns_of(path, wanted).items(), strict=True) if is_binary(path) else _columns(path, dialect)
+        )
         return cls(path, dialect, tuple(fields), tuple(map(clean_unit, units)))
 
     def numbers(self, columns: Sequence[int], timestamp: str | None = None) -> Array:

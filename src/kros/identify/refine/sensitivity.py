@@ -92,9 +92,8 @@ class _Run:
             for entry, (quantity, delay) in enumerate(window_of.quantities)
             if delay and window_of.names[entry] in read and quantity in lifting.states
         ]
-        S = np.zeros(
-            (2 + max((d for _, _, d in past), default=0), n, n * p, batch)
-        )  # now, earlier, and space for the next
+        depth = 2 + max((d for _, _, d in past), default=0)  # now, earlier, and space for the next
+        S = np.zeros((depth, n, n * p, batch))
         if (loops := library()) is not None:
             yield from self._compiled(loops, window, S, past)
             return
@@ -122,18 +121,9 @@ class _Run:
         (n, p, batch), lifting, h, m = self.W.shape, self.lifting, self.lifting.history, self.u.shape[1]
         per_unit, total = batch // self.units, (len(self.x) - 1 - h) // self.stride
         entries = (*range(n), *(entry for entry, _, _ in past))
-        job = {
-            "samples": len(self.x),
-            "batch": batch,
-            "per_unit": per_unit,
-            "history": h,
-            "stride": self.stride,
-            "terms": len(entries),
-            "depth": len(S),
-            "term": [*((state, 0) for state in range(n)), *((state, delay) for _, state, delay in past)],
-            "window": window,
-            "S": S,
-        }
+        term = [*((state, 0) for state in range(n)), *((state, delay) for _, state, delay in past)]
+        job = {"samples": len(self.x), "batch": batch, "per_unit": per_unit, "history": h, "stride": self.stride}
+        job |= {"terms": len(entries), "depth": len(S), "term": term, "window": window, "S": S}
         job |= {name: getattr(self, name) for name in ("W", "T", "x", "u", "valid", "sigma")}
         of_lifting = formulas(lifting, self.parameters, m, batch, entries)
         together = max(1, _AT_ONCE // (batch * n * (n * p + 1)))

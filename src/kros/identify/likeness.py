@@ -88,9 +88,8 @@ def unlike(channels: Sequence[str], units: Mapping[str, Mapping[Any, Array]]) ->
                 sizes = {f"Unit {unit}": ratio[i, k]}
             much = "times as much as in most units; check its column and unit of measure."
             found += [f"{what}: {channels[k]} moves {of:.3g} {much}" for what, of in sizes.items()]
-        names = {
-            title: " or ".join(channels[k] for k in of) for title, of in zip(episodes, mirrored, strict=True) if of
-        }
+        of_episodes = zip(episodes, mirrored, strict=True)
+        names = {title: " or ".join(channels[k] for k in of) for title, of in of_episodes if of}
         if 2 * len(names) > len(episodes):  # most of them: the unit's sensor
             names = {f"Unit {unit}": name for name in names.values()}
         against = "moves against the other channels, unlike in most; check its sign."

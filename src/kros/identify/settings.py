@@ -18,9 +18,7 @@ class LiftingSettings(Settings):
     """
 
     functions: Names | None = Field(None, description="lifted functions of the states, as formulas")
-    families: tuple[Record, ...] = Field(
-        (), description="tables with a kind each, whose formulas stand behind the functions"
-    )
+    families: tuple[Record, ...] = Field((), description="tables with a kind, whose formulas follow the functions")
     input_functions: Names = Field((), description="further inputs of the model, of states and inputs")
 
     @field_validator("families")
@@ -36,9 +34,7 @@ class CalibrationSettings(Settings):
 
     angle: str | None = Field(None, description="state in the periodic function; default: that of the formula")
     ratio: float | None = Field(None, gt=0, description="periods a radian; default: that of the formula, such as 100")
-    reference: str | None = Field(
-        None, description="commanded speed, which is constant for a while in the segments that are used"
-    )
+    reference: str | None = Field(None, description="commanded speed, constant for a while in segments that are used")
     measured: str | None = Field(None, description="speed that follows it and shows the periodic error")
 
 

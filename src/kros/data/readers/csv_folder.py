@@ -68,9 +68,7 @@ class CsvMapping(Dialect):
         description="regular expression; paths in which it occurs are left out. Behind the path of a file with several "
         "episodes stands which one, such as log.csv#unit/condition/episode",
     )
-    timestamp: Literal["ymd", "dmy", "mdy"] | None = Field(
-        None, description="where time is a timestamp: the order of its date; a time of day alone takes any of them"
-    )
+    timestamp: Literal["ymd", "dmy", "mdy"] | None = Field(None, description="order of the date in a column of stamps")
     pieces: int = Field(1, ge=1, le=1000, description="equal episodes that a file is cut into, `<episode>.1` ...")
     labels: dict[Literal["unit", "condition", "episode"], Column] = Field(
         {}, description='columns that state what a row belongs to, for example `{unit = "serial"}`'

@@ -227,9 +227,8 @@ def write_index(
     if converted:
         scaling = {name: replace(scale, converted=scale.factor) for name, scale in scaling.items()}
     facts = (population.sample_period_s, population.channels, population.units, dict(population.metadata))
-    PopulationIndex(*facts, tuple(replace(g, digests=()) for g in groups), population.truths, scaling).save(
-        Path(folder)
-    )
+    index = PopulationIndex(*facts, tuple(replace(g, digests=()) for g in groups), population.truths, scaling)
+    index.save(Path(folder))
 
 
 def write_parquet(population: Population, out: Path | str, converted: bool = True) -> None:

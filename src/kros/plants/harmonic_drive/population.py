@@ -205,7 +205,7 @@ class HarmonicDrivePopulation(BatchSettings):
 
     def draw(self, rng: np.random.Generator) -> Record:
         """Draw the parameters of one drive, those of its ripple last."""
-        ripple = super().draw(rng) | {
-            "ripple": RIPPLE * np.exp(self.spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))
-        }
-        return ripple | {"phase_rad": rng.uniform(0.0, 2 * np.pi, len(RIPPLE))}
+        drawn = super().draw(rng)
+        drawn["ripple"] = RIPPLE * np.exp(self.spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))
+        drawn["phase_rad"] = rng.uniform(0.0, 2 * np.pi, len(RIPPLE))
+        return drawn

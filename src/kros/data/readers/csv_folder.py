@@ -234,7 +234,8 @@ def read_csv_folder(
             if place.rows != slice(None) and chosen.exclude and re.search(chosen.exclude, part):
                 continue
             if key in places:
-                raise DataError(f"Duplicate episodes: {key} is in {places[key].table.path} and in {path}; remove one.")
+                twice = f"{key} is in {places[key].table.path} and in {path}"
+                raise DataError(f"Duplicate episodes: {twice}; name more groups in files, or remove one.")
             places[key], group = place, named.get("group", "")
             if groups.setdefault(key.unit, group) != group:
                 raise DataError(f"Unit {key.unit} is in both groups {groups[key.unit]!r} and {group!r} ({path}).")
@@ -293,11 +294,10 @@ def _matches(source: Path, mapping: CsvMapping) -> list[tuple[Path, re.Match[str
         else:
             others.append(relative)
     if not matches:
-        some_file = f"there are {len(files)} files such as {next(iter(files))!r}" if files else "there is no file"
-        raise DataError(
-            f"Reading {source} as csv: no file matches files = {mapping.files!r}, {some_file} that ends in "
-            f"{', '.join(ENDINGS[:4])}; correct the expression, or exclude."
-        )
+        none = f"there is no file that ends in {', '.join(ENDINGS[:4])}"
+        there = f"there are {len(files)} files such as {next(iter(files))!r}" if files else none
+        problem = f"no file matches files = {mapping.files!r}, {there}"
+        raise DataError(f"Reading {source} as csv: {problem}; correct the expression, or exclude.")
     if others:
         text = "%d files in %s do not match files = %r and are ignored: %s."
         log.warning(text, len(others), source, mapping.files, some(others))

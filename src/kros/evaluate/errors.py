@@ -85,8 +85,8 @@ def true_errors(signals: Array, truths: Array, lengths: Whole, dt: float) -> dic
     for length in np.unique(lengths):
         rows = lengths == length
         lag[rows] = delay_samples(signals[:length, rows], truths[:length, rows])
-    rms, percent = (errors(signals, truths, lengths) for errors in (error_rms, error_percent))
-    return {"true_rms": rms, "true_error_percent": percent, "true_lag_s": lag * dt}
+    errors = errors_of(signals, truths, lengths, dt)
+    return {f"true_{name}": values for name, values in errors.items()} | {"true_lag_s": lag * dt}
 
 
 def delay_samples(signals: Array, truths: Array) -> Array:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.linalg import svd
 
 from ...core import EPS, TINY, AnyArray, frozen
-from ...core.linalg import adjoint, energy
+from ...core.linalg import adjoint, energy, entries_first
 from ..problem.observer_problem import ObserverProblem
 
 _SMALL = float(np.sqrt(TINY))  # what is divided by it and squared stays finite
@@ -109,13 +109,11 @@ def _without_centre(s: AnyArray, q: AnyArray) -> tuple[AnyArray, AnyArray]:
 
 def _descended(c: AnyArray, d: AnyArray, g: AnyArray, multipliers: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return better multipliers of rows and columns, by turns; sums run with frequencies last."""
-    c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
-    c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
-    rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)
+    c, d, rows, columns = entries_first(c), entries_first(d), g.T, multipliers.T
     for _ in range(10):  # sweeps
         rows = _best_rows(c, columns - d)
-        columns = _best_rows(c_columns, rows - d_columns)
-    return np.moveaxis(rows, 0, -1), np.moveaxis(columns, 0, -1)
+        columns = _best_rows(c.swapaxes(0, 1), rows - d.swapaxes(0, 1))
+    return rows.T, columns.T
 
 
 def _best_rows(c: AnyArray, shift: AnyArray) -> AnyArray:

@@ -83,9 +83,8 @@ def certified_on(task: DesignTask) -> list[EpisodeBatch]:
     others = grouped(elsewhere, lambda key: key.condition)
     batches = []
     for training in (task.training, *(replace(task.recordings, keys=tuple(keys)) for keys in others.values())):
-        firsts = {key.unit: key for key in reversed(training.keys)}
-        keys = tuple(key for key in training.keys if firsts[key.unit] == key)
-        first = replace(training, keys=keys).read().head(DEFAULT.samples)
+        firsts = tuple(keys[0] for keys in grouped(training.keys, lambda key: key.unit).values())
+        first = replace(training, keys=firsts).read().head(DEFAULT.samples)
         batches.append(first if len(first.states) > TRAINING.short else training.read())
     return batches
 

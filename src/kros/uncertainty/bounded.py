@@ -22,7 +22,7 @@ from ..core.frequency import log_grid
 from ..core.linalg import sigma_max
 from ..identify.refine.metric import smallest_largest
 from .forms import Form, as_form, check_grid, check_responses, misfit, residual
-from .model import ResponseUncertainty, UncertainModel, scale_system
+from .model import ResponseUncertainty, UncertainModel
 from .settings import SET, WeightSettings
 from .weights.fit import Residuals, Sampled, fit_weight
 
@@ -83,7 +83,7 @@ def bound_systems(models: Any, form: Form, freqs_hz: ArrayLike | None, options: 
     """Return the set of systems."""
     system, options = read_systems(models, options)
     scales, ids = options.scales(system.D.shape[-2:]), options.ids(system.batch_shape[0])
-    units = scale_system(system, *scales)
+    units = system.multiplied(1 / scales[0], scales[1])
     grid = log_grid(system.dt, longest_s=getattr(models, "longest_s", None)) if freqs_hz is None else freqs_hz
     freqs = check_grid(grid, system.dt)
     fields = _bound(form, units, freqs, system.dt, ids, options)

@@ -143,13 +143,4 @@ class UncertainModel(Shown, Uncertainty, Storable):
 
     def scaled_nominal(self) -> StateSpace:
         """Return the nominal between scaled inputs and outputs, on which the weights act."""
-        return scale_system(self.nominal_system, self.output_scale, self.input_scale)
-
-
-def scale_system(system: StateSpace, output_scale: AnyArray, input_scale: AnyArray) -> StateSpace:
-    """Return `S_y^-1 G S_u`; states that are the outputs are scaled with them."""
-    rows = 1.0 / output_scale[:, None]
-    if system.n_states == len(output_scale) and np.all(np.eye(system.n_states) == system.C):
-        A, B = system.A * output_scale * rows, system.B * rows * input_scale
-        return StateSpace(A, B, system.C, system.D * rows * input_scale, system.dt)
-    return system.multiplied(1.0 / output_scale, input_scale)
+        return self.nominal_system.multiplied(1 / self.output_scale, self.input_scale)

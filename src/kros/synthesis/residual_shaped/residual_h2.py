@@ -94,7 +94,7 @@ def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
     blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
     G = blocks.reshape(k * n, k * n)
     cross = np.einsum("f,fb,fij->ibj", weight, response.conj(), spectrum, optimize=True).real.reshape(n, k * n)
-    Theta = np.linalg.solve(G, cross.T).T if k else cross
+    Theta = np.linalg.solve(G, cross.T).T
     innovation = R - Theta @ cross.T
     values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)
     if values.max() <= ITERATED * largest:

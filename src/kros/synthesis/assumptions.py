@@ -45,9 +45,12 @@ def unreachable_modes(A: AnyArray, B: AnyArray, dt: float) -> list[complex]:
     return [complex(mode) for mode, s in zip(outside, values, strict=True) if s[-1] <= ITERATED * max(s[0], TINY)]
 
 
-def h2_violations(plant: GeneralizedPlant, proper: bool) -> dict[tuple[str, str], str]:
-    """Check every assumption of H2 synthesis and return those that fail, with the values."""
-    p, failed = plant, {}
+def require(plant: Any, method: str, proper: bool = True) -> None:
+    """Raise a `SynthesisError` that names every violated assumption, a `DimensionError` for what is no plant."""
+    if not isinstance(plant, GeneralizedPlant):
+        needed = "a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt)"
+        raise DimensionError(f"{method} needs {needed}, found {type(plant).__name__}; build one first.")
+    p, failed = plant, dict[tuple[str, str], str]()
     sides = (p.A, p.B2, p.C1, p.D12), (p.A.T, p.C2.T, p.B1.T, p.D21.T)
     for (A, B, _, D), reached, regular in zip(sides, REACHED, REGULAR, strict=True):
         if modes := unreachable_modes(A, B, p.dt):
@@ -56,20 +59,12 @@ def h2_violations(plant: GeneralizedPlant, proper: bool) -> dict[tuple[str, str]
             failed[regular] = f"rank {rank} of {D.shape[1]}"
     if proper and p.dt == 0 and np.any(p.D11):
         failed[PROPER] = f"largest entry {np.abs(p.D11).max():.3g}"
+    if not failed:
+        zeros = zip(NO_ZERO, (_boundary_zeros(*side, p.dt) for side in sides), strict=True)
+        failed = {label: f"zero {found[0]:.6g}" for label, found in zeros if found}
     if failed:
-        return failed
-    zeros = zip(NO_ZERO, (_boundary_zeros(*side, p.dt) for side in sides), strict=True)
-    return {label: f"zero {found[0]:.6g}" for label, found in zeros if found}
-
-
-def require(plant: Any, method: str, proper: bool = True) -> None:
-    """Raise a `SynthesisError` that names every violated assumption, a `DimensionError` for what is no plant."""
-    if not isinstance(plant, GeneralizedPlant):
-        needed = "a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt)"
-        raise DimensionError(f"{method} needs {needed}, found {type(plant).__name__}; build one first.")
-    failed = [f"{label} ({value}): {fix}" for (label, fix), value in h2_violations(plant, proper).items()]
-    if failed:
-        raise SynthesisError(f"{method} needs a regular generalized plant; violated: {'; '.join(failed)}.")
+        texts = [f"{label} ({value}): {fix}" for (label, fix), value in failed.items()]
+        raise SynthesisError(f"{method} needs a regular generalized plant; violated: {'; '.join(texts)}.")
 
 
 def require_detectable(A: AnyArray, C: AnyArray, dt: float, method: str) -> None:

@@ -215,7 +215,7 @@ def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
 
 def stack_systems(models: Any) -> StateSpace:
     """Return a batch from a sequence of systems with the same outputs, inputs and sampling period."""
-    if isinstance(models, str) or not isinstance(models, Iterable):
+    if not isinstance(models, Iterable):
         remedy = "give a list of systems, an array of responses, or the result of kros.identify"
         raise DimensionError(f"Quantify: needs models of at least two units, found {type(models).__name__}; {remedy}.")
     systems = [StateSpace.of(system) for system in models]

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import EPS, ROUNDING, AnyArray, Array, ArrayLike, ConfigError, DataError, DimensionError, member
+from ..core import EPS, ROUNDING, TINY, AnyArray, Array, ArrayLike, ConfigError, DataError, DimensionError, member
 from ..core.frequency import nyquist_hz
 from ..core.linalg import sigma_max
 from .settings import SET
@@ -226,12 +226,13 @@ def check_grid(freqs_hz: ArrayLike, sample_period_s: float | None) -> Array:
     """Return the frequencies as an array, or say why they are no grid; without a sampling period of continuous time."""
     freqs = np.atleast_1d(np.asarray(freqs_hz, dtype=float))
     top = np.inf if sample_period_s is None else nyquist_hz(sample_period_s)
-    if freqs.ndim != 1 or freqs.size == 0 or not np.isfinite(freqs).all():
-        problem = f"found shape {freqs.shape} with {np.isnan(freqs).sum()} NaN"
-        raise ConfigError(f"Frequency grid: needs a list of finite frequencies in Hz, {problem}.")
-    if np.any(np.diff(freqs) <= 0) or freqs[0] < 0 or (sample_period_s is None and freqs[-1] == 0):
-        problem = f"frequencies should increase from zero or above, found {freqs[:5]} ... {freqs[-1]} Hz"
-        raise ConfigError(f"Frequency grid: {problem}; sort them and drop doubles.")
+    increasing = np.isfinite(freqs).all() and (np.diff(freqs, prepend=-TINY) > 0).all()
+    if freqs.ndim != 1 or not freqs.size or not increasing or (sample_period_s is None and freqs[-1] == 0):
+        problem = f"found shape {freqs.shape}, {freqs.ravel()[:5]} ..., {np.isnan(freqs).sum()} NaN"
+        remedy = "sort them and drop doubles"
+        raise ConfigError(
+            f"Frequency grid: needs frequencies in Hz that increase from zero or above, {problem}; {remedy}."
+        )
     if freqs[-1] > top * (1 + ROUNDING):
         limit = f"the Nyquist frequency {top} Hz of the sampling period {sample_period_s} s"
         raise ConfigError(f"Frequency grid: {freqs[-1]} Hz is above {limit}; end the grid there.")

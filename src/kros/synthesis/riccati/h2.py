@@ -116,6 +116,8 @@ def riccati_pair(p: GeneralizedPlant, method: str) -> tuple[AnyArray, AnyArray]:
 
 def absorb_feedthrough(K: StateSpace, D22: AnyArray) -> StateSpace:
     """Turn a controller for ``y - D22 u`` into one for ``y``."""
+    if not np.any(D22):
+        return K
     loop = np.eye(K.n_outputs) + K.D @ D22
     if cond(loop) > SINGULAR:
         raise SynthesisError("Algebraic loop: I + D^c D22 is singular; add a delay to the plant, or change D22.")

@@ -13,22 +13,13 @@ from ..data import EpisodeBatch
 from ..evaluate.errors import error_rms
 from ..identify import ModelSet
 from ..loops import recursion
-from ..observer import (
-    Observer,
-    ReliftCertificate,
-    ReliftScales,
-    ReliftStatus,
-    Screen,
-    factors,
-    one_step_residual,
-    relift_certificate,
-    run_observer,
-)
+from ..observer import Observer, ReliftScales, Screen, factors, one_step_residual
+from ..observer.certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound, linear_estimate
 from ..observer.estimator.gaps import losses
 from ..observer.runtime import Guard
-from ..observer.simulate import run_observers
+from ..observer.simulate import run_observer, run_observers
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import certify_errors
 from ..uncertainty import UncertainModel

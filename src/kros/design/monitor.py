@@ -61,22 +61,20 @@ def fit_monitor(
     if len(units) < LEAST_SCORES:
         log.info("%s has no monitor: it needs %d units, found %d.", observer.name, LEAST_SCORES, len(units))
         return None
-    size = np.sqrt(
-        np.mean(
-            [np.mean(np.minimum(nu[judged] ** 2, np.sqrt(np.finfo(float).max)), axis=0) for nu, judged in every], axis=0
-        )
-    )
+    largest_square = np.sqrt(np.finfo(float).max)
+    squares = [np.minimum(nu[judged] ** 2, largest_square).mean(axis=0) for nu, judged in every]
+    size = np.sqrt(np.mean(squares, axis=0))
     if not (np.isfinite(size) & (size > 0)).all():
         return None
     filters = octaves()
     even, forget, first = np.ones((len(size), len(filters))), 1 / settings.memory, 1 / settings.beginning
     free = Monitor(filters, forget, settle, size, even, weighted(even), rate, len(units), first)
     # Mean squares are computed wherever they are needed: all of them would fill a memory.
-    squares = {group: partial(free.in_turn, run) for group, run in episodes.items()}
-    most = {group: np.max([p.max(axis=0) for p in of()], axis=0) for group, of in squares.items()}
+    in_turn = {group: partial(free.in_turn, run) for group, run in episodes.items()}
+    most = {group: np.max([p.max(axis=0) for p in of()], axis=0) for group, of in in_turn.items()}
     largest = {group: 10 * np.log10(np.maximum(values, EPS**2)) for group, values in most.items()}
     weights = weighted(steady(largest, settings))
-    peaks = {group: [float(_decibels(p, weights).max()) for p in of()] for group, of in squares.items()}
+    peaks = {group: [float(_decibels(p, weights).max()) for p in of()] for group, of in in_turn.items()}
     bound = bound_of_peaks([max((p for (u, _), p in peaks.items() if u == unit), key=max) for unit in units], settings)
     shape = np.mean(list(largest.values()), axis=0)
     limits = 10 ** ((shape - (shape * weights).sum() / WEIGHT + bound) / 10)

@@ -58,10 +58,8 @@ class Controller(Settings):
                 named = f"with {q} inputs and {m} outputs named, {n} states"
                 raise ConfigError(f"Controller: {name} should have the shape {shape} {named}, found {matrix.shape}.")
             matrices.append(matrix.reshape(shape))
-        read, write = (
-            self._places(observer, *signals)
-            for signals in ((self.inputs, observer.recorded), (self.outputs, models.recorded_inputs))
-        )
+        read = self._places(observer, self.inputs, observer.recorded)
+        write = self._places(observer, self.outputs, models.recorded_inputs)
         A, B, C, D = matrices
         return gain(write, dt) @ StateSpace(A, B, C, D, dt) @ gain(np.linalg.pinv(read), dt)
 

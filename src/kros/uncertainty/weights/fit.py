@@ -198,12 +198,11 @@ class Residuals:
         grid = np.unique(np.concatenate([[0.0], freqs_hz, [nyquist_hz(dt)]]))
         parts = (*self._systems(remainder=False), *self._plants())
         modes = np.concatenate([np.zeros(0, complex), *(part.poles() for part in parts)])
-        omega = modes.imag[modes.imag > 0]
-        half = np.abs(modes.real[modes.imag > 0])
-        at_hz, width_hz = np.arctan(omega) / (np.pi * dt), half / (1 + omega**2) / (np.pi * dt)
-        narrow = width_hz < np.interp(at_hz, grid, np.gradient(grid))
-        around = omega[narrow] + half[narrow] * np.array([[-1.0], [0.0], [1.0]])
-        return np.unique(np.arctan(around[around > 0]) / (np.pi * dt))
+        omega, half = modes.imag[modes.imag > 0], np.abs(modes.real[modes.imag > 0])
+        at = np.arctan(omega + half * np.array([[-1.0], [0.0], [1.0]])) / (np.pi * dt)
+        width = half / (1 + omega**2) / (np.pi * dt)
+        at = at[:, width < np.interp(at[1], grid, np.gradient(grid))]
+        return np.unique(at[at > 0])
 
     def _plants(self) -> list[Descriptor]:
         """Return the nominal and the units where they are systems."""

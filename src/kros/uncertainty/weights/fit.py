@@ -1,8 +1,9 @@
 r"""Weights from residuals: a fit at few frequencies, a check at many, a proof at all.
 
-All magnitudes of a diagonal weight are fitted together (`joint`). The fit is checked on a grid ten times denser, with
-DC, Nyquist and the modes of units and weights; frequencies that it misses join it. What counts is the proof
-for the systems as returned (`proof`); at last the left weight is scaled until it touches.
+All magnitudes of a diagonal weight are fitted together (`joint`), at the frequencies given and at modes of units and
+residuals that these pass over. The fit is checked on a grid ten times denser, with DC and Nyquist; frequencies that it
+misses join it. What counts is the proof for the systems as returned (`proof`); at last the left weight is scaled until
+it touches.
 """
 
 from __future__ import annotations
@@ -194,7 +195,7 @@ class Residuals:
         return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= PROOF.rows else []
 
     def modes_hz(self, freqs_hz: AnyArray, dt: float) -> AnyArray:
-        """Return frequencies of modes of residuals and plants, and a half-width beside them, that a grid passes over."""
+        """Return frequencies of modes of residuals and plants that a grid passes over, and half a width beside."""
         grid = np.unique(np.concatenate([[0.0], freqs_hz, [nyquist_hz(dt)]]))
         parts = (*self._systems(remainder=False), *self._plants())
         modes = np.concatenate([np.zeros(0, complex), *(part.poles() for part in parts)])

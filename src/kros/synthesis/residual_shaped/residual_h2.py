@@ -37,7 +37,7 @@ from functools import cached_property
 import numpy as np
 
 from ...core import ITERATED, ROUNDING, TINY, AnyArray, Flags, StateSpace, SynthesisError, block_diagonal, frozen, gain
-from ...core.norms import gramian, gramian_root, h2_norm
+from ...core.norms import gramian, gramian_root
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.h2 import balancing, kalman, predictor_bound
 
@@ -210,7 +210,7 @@ def residual_h2(
     full = problem.filter()
     most = full.n_states if max_order is None else max_order
     K = problem.reduced(full, problem.correction(full), tolerance_percent, most)
-    norm = h2_norm(problem.loop(full, K))
+    norm = float(np.linalg.norm(problem.deviations(full, K)))
     note = f"mean of {len(problem.spectra)} units, {problem.basis.delays} delays, lags {problem.basis.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
     lower, gap, notes = enclosed(norm, problem.lower_bound(full))

@@ -87,8 +87,19 @@ class Source:
 
     def context(self) -> Record:
         """Return what the templates name: the observer and its parts, names, sizes, and matrices."""
-        o, lifting, loop, factors = self.observer, self.observer.lifting, self.loop, self.factors()
-        low, high = bounds(o.guard, lifting.n_states, o.controller.n_states)
+        o, lifting, loop, factors, K = (
+            self.observer,
+            self.observer.lifting,
+            self.loop,
+            self.factors(),
+            self.observer.controller,
+        )
+        low, high = bounds(o.guard, lifting.n_states, K.n_states)
+        model, correction = (
+            np.hstack([o.A, o.B])[: lifting.n_states],
+            o.into[: lifting.n_states] @ np.hstack([K.C, K.D]),
+        )
+        controller, moving = np.hstack([K.A, K.B]), () if self.shift is None else self.shift.states[: len(o.recorded)]
         return {
             "o": o,
             "lifting": lifting,
@@ -98,7 +109,7 @@ class Source:
             "bank": o.bank,
             "bridges": self.bridges(),
             "shift": self.shift,
-            "shift_others": self.shift_others,
+            "shift_others": [i for i in np.flatnonzero(moving).tolist() if i != o.measured[0]],
             "load": self.load_torque(),
             "tracked": None if loop is None else self.tracked(loop),
             "name": self.name,
@@ -118,7 +129,7 @@ class Source:
             "q": len(o.measured),
             "m": len(o.inputs),
             "functions": len(lifting.functions),
-            "order": o.controller.n_states,
+            "order": K.n_states,
             "delay": o.runtime.delay,
             "start": o.runtime.first(lifting.n_states),
             "history": len(lifting.window.earlier),
@@ -130,20 +141,11 @@ class Source:
             "rule": {"beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},
             "longest": Screen.of(o).longest,
             "far": RULE.far,
-        } | self.linear()
-
-    @property
-    def shift_others(self) -> list[int]:
-        """Recorded states beside the measured one that move with the origin."""
-        moving = [] if self.shift is None else np.flatnonzero(self.shift.states[: len(self.observer.recorded)]).tolist()
-        return [i for i in moving if i != self.observer.measured[0]]
-
-    def linear(self) -> Record:
-        """Return the model and the correction, zeros left out."""
-        o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
-        parts = np.hstack([o.A, o.B])[:n], o.into[:n] @ np.hstack([K.C, K.D]), np.hstack([K.A, K.B])
-        sums = dict(zip(("model", "correction", "controller"), map(self.sums, parts), strict=True))
-        return sums | {"operations": sum(np.count_nonzero(part) for part in parts)}
+            "model": self.sums(model),
+            "correction": self.sums(correction),
+            "controller": self.sums(controller),
+            "operations": sum(map(np.count_nonzero, (model, correction, controller))),
+        }
 
     def factors(self) -> dict[str, float]:
         """Return by what recordings are multiplied, by name; a load torque has the unit of its current."""

@@ -123,11 +123,6 @@ class Bank:
         size[first] = np.outer(rms[first][moving :: self.channels], [*rms[:moving], 1.0]).ravel()
         return np.maximum(size, ITERATED * size.max())
 
-    def trust(self, nonlinear: float) -> Array:
-        """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
-        channel = self.channel
-        return np.where(channel >= self.linear, nonlinear, 0.0)
-
     @property
     def first(self) -> slice:
         """Entries of the first sample."""

@@ -27,11 +27,10 @@ from .settings import EstimatorSettings
 
 @frozen
 class Identified:
-    """An estimator with its readout, its family of channels, and facts for the records."""
+    """An estimator with its readout, and facts for the records."""
 
     observer: Observer
     readout: Readout
-    family: str
     facts: dict[str, Any]
 
 
@@ -120,7 +119,7 @@ def identify_estimator(
         "outside_models_percent": by_state(outside_percent(readout, lifting)),
         "settle_samples": settle_samples(systems, bank.recovery),
     }
-    return Identified(observer, readout, family, facts)
+    return Identified(observer, readout, facts)
 
 
 def require_known(unbounded: Mapping[str, Sequence[str]], measured: Sequence[str], inputs: Sequence[str]) -> None:

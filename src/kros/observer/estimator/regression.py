@@ -39,7 +39,7 @@ class Whitening:
         bank, settings = design.bank, design.settings
         size = bank.sizes(np.linalg.norm(sample.rows, axis=0))
         disturbed, elsewhere = sample.restarts / size, sample.elsewhere / size
-        trust = np.vstack([np.diag(bank.trust(settings.nonlinear_trust)), sample.errors / size])
+        trust = np.vstack([np.diag(settings.nonlinear_trust * (bank.channel >= bank.linear)), sample.errors / size])
         starts = np.sqrt(settings.settled_share) * disturbed, np.sqrt(settings.start_share) * elsewhere
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([sample.rows / size, trust, *starts])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))

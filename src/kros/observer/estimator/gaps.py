@@ -40,28 +40,25 @@ def training(observer: Observer, recordings: Recordings, settings: EstimatorSett
 def decay(apart: Array, judged: Sequence[int]) -> Array:
     """Return the stable matrix (n, n) by which distances (n_samples, batch, n) from estimates of inputs alone decay.
 
-    Of a factor for every state and of roots of regressions over several lags, it is what predicts some states best over
-    all of these lags.
+    Of roots of regressions over several lags, it is what predicts some states best over all of these lags.
     """
     n, longest = apart.shape[-1], 4 * len(apart)
     lags = np.unique(np.geomspace(1, max(2, len(apart) // 4), 12).round().astype(int)).tolist()
     pairs = [(apart[lag:].reshape(-1, n), apart[:-lag].reshape(-1, n)) for lag in lags]
     moments = [[one.T @ other / len(one) for one, other in ((a, a), (a, b), (b, b))] for a, b in pairs]
 
-    def missed(F: Array) -> Array:
+    def missed(F: Array) -> float:
         powers = [np.linalg.matrix_power(F, lag) for lag in lags]
         left = [np.diag(a - 2 * b @ P.T + P @ c @ P.T) for P, (a, b, c) in zip(powers, moments, strict=True)]
-        return np.log(np.maximum(left, TINY)).sum(axis=0)
+        return float(np.log(np.maximum(left, TINY))[:, judged].sum())
 
-    factors = np.append(np.exp(-1 / np.geomspace(1, longest, 40)), 1.0)
-    best = np.argmin([missed(rho * np.eye(n)) for rho in factors], axis=0)
-    found = [np.diag(factors[best])]
+    found = []
     for lag, (_, later, now) in zip(lags, moments, strict=True):
         values, modes = np.linalg.eig(later @ np.linalg.pinv(now, hermitian=True))
         roots = np.where((values.imag == 0) & (values.real < 0), 0.0, values) ** (1 / lag)  # gone within the lag
         roots *= np.minimum(1, np.exp(-1 / longest) / np.maximum(abs(roots), TINY))
         found.append((modes * roots @ np.linalg.pinv(modes)).real)
-    return min(found, key=lambda F: missed(F)[judged].sum())
+    return min(found, key=missed)
 
 
 def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:

@@ -50,8 +50,8 @@ class Blocks:
 
     def over(self, level: float, which: Flags) -> Blocks:
         """Return the system with some outputs divided by a level."""
-        by, s = np.where(which, 1 / level, 1.0)[:, None], self.system
-        return replace(self, system=replace(s, C=s.C * by, D=s.D * by))
+        system = self.system.multiplied(np.where(which, 1 / level, 1.0), np.ones(self.system.n_inputs))
+        return replace(self, system=system)
 
     def at(self, nu: ArrayLike) -> tuple[AnyArray, AnyArray, AnyArray]:
         """Return M, (f, z, w), scalings that balance its blocks, and the scaled gains, (f,), at mapped frequencies."""

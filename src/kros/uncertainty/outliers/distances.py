@@ -41,7 +41,7 @@ def distances(form: Form, responses: AnyArray, freqs_hz: AnyArray) -> Distances:
     itself = nominals[:, None] == np.arange(len(responses))
     parts = pieces(responses.shape[1], OUTLIER.at_once // (itself.size * max(responses.shape[2:]) ** 2))
     sigma, left, right = zip(*(_scaled(form, responses[:, part], nominals, itself) for part in parts), strict=True)
-    level = _smooth(20 * np.log10(np.maximum(np.concatenate(sigma, axis=2), OUTLIER.least)), freqs_hz)
+    level = _levels(np.concatenate(sigma, axis=2), freqs_hz)
     level[itself] = np.nan
     median = np.nanmedian(level, axis=0)
     return Distances(nominals, level.max(axis=2), median, np.concatenate(left), np.concatenate(right))
@@ -62,7 +62,7 @@ def _scaled(form: Form, G: AnyArray, nominals: AnyArray, itself: AnyArray) -> tu
 def scaled_levels(form: Form, nominal: AnyArray, perturbed: AnyArray, found: Distances, freqs_hz: AnyArray) -> AnyArray:
     """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB."""
     E = residual(form, nominal, perturbed) / found.left[:, :, None] / found.right[:, None, :]
-    return _smooth(20 * np.log10(np.maximum(sigma_max(E), OUTLIER.least)), freqs_hz)
+    return _levels(sigma_max(E), freqs_hz)
 
 
 def typical(squares: AnyArray) -> tuple[AnyArray, AnyArray]:
@@ -102,8 +102,9 @@ def _same(G: AnyArray, nominals: AnyArray) -> Flags:
     return apart <= OUTLIER.smallest * np.maximum(size, size[nominals][:, None])
 
 
-def _smooth(level: AnyArray, freqs: AnyArray) -> AnyArray:
-    """Moving average over log frequency, to a billionth of a dB."""
+def _levels(sigma: AnyArray, freqs: AnyArray) -> AnyArray:
+    """Moving average of singular values in dB over log frequency, to a billionth of a dB."""
+    level = 20 * np.log10(np.maximum(sigma, OUTLIER.least))
     x = np.log10(freqs)
     near = (np.abs(x[:, None] - x) <= OUTLIER.smoothing / 2).astype(float)
     return np.round(level @ (near / near.sum(axis=0)), 9)

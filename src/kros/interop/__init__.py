@@ -11,9 +11,8 @@ Examples
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from ..core.lazy import lazy_names
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .control import from_control, to_control
@@ -22,4 +21,14 @@ if TYPE_CHECKING:
 __all__ = ["KoopmanRegressor", "from_control", "to_control"]
 
 _HOME = dict.fromkeys(__all__, "control") | {"KoopmanRegressor": "sklearn_estimator"}
-__getattr__, __dir__ = lazy_names(__name__, _HOME)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a bridge on first use (PEP 562)."""
+    if name in _HOME:
+        return getattr(import_module(f".{_HOME[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

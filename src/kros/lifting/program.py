@@ -6,7 +6,7 @@ operations is the same everywhere, so that results agree to rounding.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core import Array, frozen
+from ..core import Array, ByName, Names, frozen
 
 Codes = npt.NDArray[np.int32]
 Tree = tuple[Any, ...]
@@ -28,7 +28,7 @@ _UFUNCS: list[np.ufunc] = [getattr(np, _NUMPY.get(kind, kind)) for kind in _KIND
 class Program:
     """Operations of some expressions; registers hold the quantities, then the constants, then results."""
 
-    names: tuple[str, ...]  # quantities
+    names: Names  # quantities
     constants: Array  # shape (constants,)
     code: Codes  # shape (operations, 4): kind, register of the result, registers of the two operands
     outputs: Codes  # register of every expression
@@ -41,7 +41,7 @@ class Program:
         writer = Writer(used if names is None else list(names))
         return writer.finished([writer.write(tree_of(expression)) for expression in expressions])
 
-    def run(self, values: Mapping[str, Any]) -> list[Any]:
+    def run(self, values: ByName) -> list[Any]:
         """Return the values of the expressions for arrays by name, which broadcast against each other."""
         registers: list[Any] = [values[name] for name in self.names] + self.constants.tolist()
         registers += [None] * (self.registers - len(registers))
@@ -49,7 +49,7 @@ class Program:
             registers[into] = function(*(registers[i] for i in operands))
         return [registers[i] for i in self.outputs]
 
-    def fill(self, out: Array, values: Mapping[str, Any]) -> None:
+    def fill(self, out: Array, values: ByName) -> None:
         """Write the values of the expressions along the last axis."""
         for column, value in enumerate(self.run(values)):
             out[..., column] = value

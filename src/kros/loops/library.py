@@ -6,14 +6,13 @@ import ctypes
 import logging
 import os
 import re
-from collections.abc import Mapping
 from functools import cache, lru_cache
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
-from ..core import Array, ConfigError, Parameters
+from ..core import Array, ByName, ConfigError, Parameters, Record
 from ..lifting import Lifting
 from ..lifting.program import Program
 from .compiler import load
@@ -44,14 +43,14 @@ class Library:
                 field: (_TYPES[kind], not given) if pointer else None for given, kind, pointer, field in fields
             }
 
-    def call(self, name: str, *jobs: tuple[str, Mapping[str, Any]]) -> None:
+    def call(self, name: str, *jobs: tuple[str, ByName]) -> None:
         """Call a function with structs by type: numbers and arrays by field, nothing for a field that is left out."""
         alive: list[Any] = []  # arrays that were made here live until the call is over
         structs = [self._struct(type_, values, alive) for type_, values in jobs]
         if self._code[name](*structs):
             raise MemoryError(f"Time loop {name}: there is no memory left for its state.")
 
-    def _struct(self, type_: str, values: Mapping[str, Any], alive: list[Any]) -> ctypes.Array[ctypes.c_int64]:
+    def _struct(self, type_: str, values: ByName, alive: list[Any]) -> ctypes.Array[ctypes.c_int64]:
         fields = self._types[type_]
         unknown = values.keys() - fields.keys()
         assert not unknown, unknown
@@ -84,7 +83,7 @@ def library() -> Library | None:
 
 def formulas(
     lifting: Lifting, values: Parameters | None, m: int, batch: int, entries: tuple[int, ...] = ()
-) -> tuple[str, dict[str, Any]]:
+) -> tuple[str, Record]:
     """Return what the loops need to know of a lifting with m recorded inputs and parameters of shape (batch,)."""
     given = lifting.parameter_values(values)
     own = np.array([np.broadcast_to(given[name], (batch,)) for name in lifting.parameters])
@@ -92,7 +91,7 @@ def formulas(
 
 
 @lru_cache
-def _tape(lifting: Lifting, m: int, entries: tuple[int, ...]) -> dict[str, Any]:
+def _tape(lifting: Lifting, m: int, entries: tuple[int, ...]) -> Record:
     """Return the formulas of a lifting, and their slopes by entries of the window, as one program."""
     window, n, n_lifted = lifting.window, lifting.n_states, lifting.n_lifted
     inputs = lifting.inputs or tuple(f"input {i}" for i in range(m))  # which no formula can read

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from enum import Enum
 
-from ..core import AGREED, StateSpace, Storable, SynthesisError, frozen
+from ..core import AGREED, Names, StateSpace, Storable, SynthesisError, frozen
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +79,7 @@ class Synthesis(Storable):
     gap_percent: float | None = None  # ``100 (value / lower_bound - 1)``
     quadrature_error: float | None = None  # of `worst_case_h2`, already included in it
     spectral_radius: float | None = None  # of the nominal loop (continuous: the largest real part)
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
 
     def __post_init__(self) -> None:
         if self.gap_percent is not None and not self.gap_percent >= 0:
@@ -87,7 +87,7 @@ class Synthesis(Storable):
             raise SynthesisError(f"Synthesis {self.method}: {problem}; please report the plant.")
 
 
-def enclosed(value: float, lower: float | None) -> tuple[float | None, float | None, tuple[str, ...]]:
+def enclosed(value: float, lower: float | None) -> tuple[float | None, float | None, Names]:
     """Return the lower bound of an attained value, their distance in percent, and notes."""
     if value == 0 or lower == 0:
         return 0.0, None, ()

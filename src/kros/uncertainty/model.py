@@ -9,11 +9,10 @@ S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from ..core import AnyArray, StateSpace, Storable
+from ..core import AnyArray, Names, Record, StateSpace, Storable
 from ..data import Shown
 from .forms import Form
 from .weights.cover import Cover, Weight
@@ -24,7 +23,7 @@ class Uncertainty:
     """A bound on how the units of a population differ from a nominal one."""
 
     form: Form
-    unit_ids: tuple[str, ...]  # units that the weights cover
+    unit_ids: Names  # units that the weights cover
     nominal: int  # row of the nominal unit
     nominal_id: str
     freqs_hz: AnyArray  # (frequency,), Hz
@@ -130,7 +129,7 @@ class UncertainModel(Shown, Uncertainty, Storable):
     KIND = "uncertain_model"
     nominal_system: StateSpace
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         nominal = f"unit {self.nominal_id}, {self.nominal_system.n_states} states"
         rows = {"units": len(self.unit_ids), "nominal": nominal, "uncertainty": self.about}
         rows |= {"residual over bound": self.cover_max, "bound above optimum": f"{self.overbound_db_max:.3g} dB"}

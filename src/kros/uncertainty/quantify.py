@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import ArrayLike, ConfigError, IdentificationError, Work
+from ..core import ArrayLike, ConfigError, IdentificationError, Record, Work
 from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
 from ..core.linalg import sigma_max
 from ..data import Shown
@@ -49,7 +49,7 @@ class UncertainModels(Shown):
     nominal: str  # unit that all others are compared with
     worst_off_nominal: str  # the unit farthest from it
     sets: Mapping[str, UncertainModel]  # by kind of model
-    scores: tuple[dict[str, Any], ...] = ()  # outlier scores, one row a unit and condition
+    scores: tuple[Record, ...] = ()  # outlier scores, one row a unit and condition
     outliers: Mapping[str, OutlierModel] = field(default_factory=dict)  # by place of the models in `models.sets`
 
     def __repr__(self) -> str:
@@ -57,9 +57,9 @@ class UncertainModels(Shown):
         kinds, scores = ", ".join(self.sets), f"{flagged} of {len(self.scores)} outlier scores flagged"
         return f"<UncertainModels: {kinds}, nominal unit {self.nominal}, {scores}>"
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         flagged = [f"{row['unit']} ({row['condition']})" for row in self.scores if row["outlier"]]
-        rows: dict[str, Any] = {kind: uncertain.about for kind, uncertain in self.sets.items()}
+        rows: Record = {kind: uncertain.about for kind, uncertain in self.sets.items()}
         rows |= {"nominal unit": self.nominal, "farthest unit": self.worst_off_nominal}
         return rows | {"outliers": ", ".join(flagged) or "none"}
 
@@ -75,7 +75,7 @@ class UncertainModels(Shown):
         for place, outliers in self.outliers.items():
             outliers.save(folder / "outliers" / place)
         write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
-        content: dict[str, Any] = {"nominal": self.nominal, "worst_off_nominal": self.worst_off_nominal}
+        content: Record = {"nominal": self.nominal, "worst_off_nominal": self.worst_off_nominal}
         content |= {"kinds": list(self.sets), "outliers": list(self.outliers)}
         save_artifact(folder / "uncertainty", _KIND, content)
 

@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from ..core import AnyArray, StateSpace, Storable, block_diagonal, frozen, gain
+from ..core import AnyArray, Names, StateSpace, Storable, block_diagonal, frozen, gain
 from ..core.linalg import sigma_max
 from .forms import Form, residual
 from .settings import SET
@@ -31,8 +31,8 @@ class UnitResiduals(Storable):
     KIND = "unit_residuals"
     form: Form
     nominal_id: str
-    unit_ids: tuple[str, ...]  # covered units, and others
-    outside: tuple[str, ...]  # units that the weights do not have to cover
+    unit_ids: Names  # covered units, and others
+    outside: Names  # units that the weights do not have to cover
     freqs_hz: AnyArray  # (frequency,), Hz
     entries: AnyArray  # (unit, frequency, p', m'): magnitudes of the residual's entries, in scaled coordinates
     ratio: AnyArray  # (unit, frequency): ``sigma_max(W_L^-1 E W_R^-1)``

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core import ITERATED, StateSpace, SynthesisError, require_kind
+from ...core import ITERATED, Names, StateSpace, SynthesisError, require_kind
 from ...core.norms import gramian_root, h2_norm, hinf_norm
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
@@ -114,7 +114,7 @@ def verify(plant: GeneralizedPlant, controller: StateSpace) -> Synthesis:
     return Synthesis("mixed", controller, Status.CERTIFIED, h2_norm=norm, hinf_norm=peak, spectral_radius=radius)
 
 
-def _reduced(plant: GeneralizedPlant) -> tuple[GeneralizedPlant, tuple[str, ...]]:
+def _reduced(plant: GeneralizedPlant) -> tuple[GeneralizedPlant, Names]:
     """Plant for the inequalities of a stable one, and what was done to it; measurements in units of their noise."""
     noise = np.linalg.norm(plant.D21[:, plant.columns(1)], axis=1)
     small, tail = truncate(plant.transformed(y=np.diag(1 / noise)), _STATES)

@@ -26,7 +26,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core import AnyArray, ArrayLike, ConfigError, DataError, Storable, frozen
+from ...core import AnyArray, ArrayLike, ConfigError, DataError, Names, Storable, frozen
 from ..forms import Form, as_form, check_grid, check_responses, evenly
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
@@ -66,7 +66,7 @@ class OutlierModel(Storable):
 
     KIND = "outlier_model"
     form: Form
-    unit_ids: tuple[str, ...]
+    unit_ids: Names
     freqs_hz: AnyArray
     responses: AnyArray
     output_scale: AnyArray
@@ -129,7 +129,7 @@ def score_outliers(
     freqs_hz: ArrayLike,
     form: Form | str = Form.ADDITIVE,
     *,
-    unit_ids: tuple[str, ...] | None = None,
+    unit_ids: Names | None = None,
     false_alarm_rate: float = 0.01,
 ) -> OutlierModel:
     """Score every unit of a population against the others.

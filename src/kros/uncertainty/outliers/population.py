@@ -13,11 +13,10 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 
-from ...core import AnyArray, Work, frozen
+from ...core import AnyArray, Record, Work, frozen
 from ...identify import Factor, ModelSet, combine
 from ...identify.factors import lifted_factor
 from ...identify.identified import EpisodeFactors, IdentifiedModels
@@ -33,7 +32,7 @@ log = logging.getLogger(__name__)
 
 def score_population(
     models: IdentifiedModels, settings: QuantifySettings, work: Work
-) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
+) -> tuple[dict[str, OutlierModel], list[Record]]:
     """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
     known = {condition: models.sets[place] for condition, place in places.items() if place in models.sets}
@@ -41,7 +40,7 @@ def score_population(
     for condition in sorted(known.keys() - scored.keys()):
         log.info("%s: outlier scores need at least three units", condition)
     tasks = [partial(score_condition, models.factors[c], identified, settings) for c, identified in scored.items()]
-    rows, found = list[dict[str, Any]](), dict[str, OutlierModel]()
+    rows, found = list[Record](), dict[str, OutlierModel]()
     for condition, (outliers, samples) in zip(scored, work.run("score outliers", tasks), strict=True):
         found[places[condition]] = outliers
         for score, n_samples in zip(outliers.scores, samples, strict=True):
@@ -76,7 +75,7 @@ def score_condition(
     return replace(outliers, scores=qualified), [data.n_samples for data in evidence]
 
 
-def score_row(score: OutlierScore, models: ModelSet, episodes: int, recorded_s: float) -> dict[str, Any]:
+def score_row(score: OutlierScore, models: ModelSet, episodes: int, recorded_s: float) -> Record:
     """Return a score as a row of metrics, with what was recorded and what is needed."""
     same = ["outlier", "freq_hz", "excess_db", "lowest_db", "highest_db", "status", "fewest_units"]
     row = {"unit": score.unit, "condition": models.condition, "score": score.score_db, "threshold": score.threshold_db}

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...core import AnyArray, Flags, frozen
+from ...core import AnyArray, Flags, Names, frozen
 from ..forms import Form, evenly
 from ..settings import OUTLIER
 from .distances import Distances, scaled_levels
@@ -77,7 +77,7 @@ class Comparison:
     inliers: Flags
     rate: float  # of false alarms
 
-    def scores(self, ids: tuple[str, ...], threshold: float, margin_db: AnyArray) -> tuple[OutlierScore, ...]:
+    def scores(self, ids: Names, threshold: float, margin_db: AnyArray) -> tuple[OutlierScore, ...]:
         """Return scores of the last units, whose names and margins are given."""
         levels, scores = self.distances.levels, []
         excess, by_nominal = (excesses(v, self.inliers) for v in (levels.max(axis=1), self.distances.peaks))

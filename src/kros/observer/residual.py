@@ -184,7 +184,7 @@ def _choices(measured: Columns, hidden: Sequence[int]) -> list[tuple[int, ...]]:
 
 
 def least_squares(regressors: Array, values: Array) -> Array:
-    """Return the smallest least-squares X of ``regressors X = values``, every regressor in units of its largest value."""
+    """Return the smallest least-squares X of ``regressors X = values``, each regressor over its largest value."""
     size = np.abs(regressors).max(axis=0, initial=0.0)
     size[size == 0] = 1.0
     return np.linalg.lstsq(regressors / size, values, rcond=None)[0] / size[:, None]

@@ -204,7 +204,7 @@ def stepped(course: Course, samples: Screened) -> Stepped:
 
 
 def _compiled(loops: Library, course: Course, samples: Screened) -> Stepped | None:
-    """Run an observer on in the compiled loop; None where a machine would leave its bounds: all stay where they were."""
+    """Run an observer on in the compiled loop; None where a machine would leave its bounds: all stay."""
     observer, steps, u, q = course.observer, course.steps, course.with_past(samples.u), list(course.observer.measured)
     (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
     late = np.clip(np.arange(n_samples) + int(course.since[0]) + 1, 0, d)  # samples between a state and its row

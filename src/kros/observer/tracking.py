@@ -42,8 +42,8 @@ class PhaseLockedLoop:
         of_inputs = any(name in formula.used for formula in lifting.input_formulas)
         if name not in lifting.parameters or lifting.history or of_inputs or observer.runtime.delay:
             raise ConfigError(
-                f"Phase-locked loop of {observer.name}: needs functions of present states with the parameter {name!r} and "
-                f"no delay, found {lifting.parameters}, a history of {lifting.history}, a delay of {observer.runtime.delay}."
+                f"Phase-locked loop of {observer.name}: needs functions of present states with the parameter {name!r}, "
+                f"found {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
             )
         if not settle_s > 0:
             raise ConfigError(

@@ -18,7 +18,7 @@ from ..observer import Observer
 from ..runtime import Runtime
 from .certificate import outside_percent
 from .channels import FAMILIES, channels_of
-from .gaps import distances, training, with_gaps
+from .gaps import distances, with_gaps
 from .reduction import Filters, reduced
 from .regression import Readout, is_less
 from .rows import Design, Recordings
@@ -88,22 +88,36 @@ def identify_estimator(
     readout, blind, family = best_family(lifting, measured, inputs, recordings, settings, hidden, poles)
     held = [measured[i] for i in blind.design.channels.held]
 
-    filters = reduced(readout, settings.order)
-    fallback = reduced(replace(blind, coefficients=blind.coefficients[:, :n]), settings.order)
-    systems = filters, fallback
-    observer = assembled(name, lifting, inputs, readout.design, systems, sample_period_s, parameters or {})
-    signals = training(observer, recordings, settings)
-    F, apart = distances(observer, signals, held)
-    A, near, bank = observer.A.copy(), [i for i in measured if i not in held], observer.bank
-    assert bank is not None
-    offset = slice(observer.lifting.n_states - n, observer.lifting.n_states)
-    A[offset, offset] = F  # distances from the estimates of inputs alone decay
-    reach = bank.reach.copy()
-    reach[near] = settings.reach * apart[near]
-    limits = bounded(observer, recordings, settings)
-    observer = replace(observer, A=A, runtime=limits, bank=replace(bank, reach=reach))
-    bank, states = with_gaps(observer, signals, recordings.length, F, settings), lifting.states
-    observer = replace(observer, bank=bank)
+    def observer_of(filters: Filters, fallback: Filters) -> Observer:
+        return assembled(name, lifting, inputs, readout.design, (filters, fallback), sample_period_s, parameters or {})
+
+    def fallback_of(one: Readout, order: int | None) -> Filters:
+        return reduced(replace(one, coefficients=one.coefficients[:, :n]), order)
+
+    filters, fallback = reduced(readout, settings.order), fallback_of(blind, settings.order)
+    observer, orders = observer_of(filters, fallback), (len(filters.A), len(fallback.A))
+    F, apart = distances(observer, recordings, settings, held)
+    near = [i for i in measured if i not in held]
+
+    def complete(one: Observer) -> Observer:
+        assert one.bank is not None
+        reach = one.bank.reach.copy()
+        reach[near] = settings.reach * apart[near]
+        return replace(let_go(one, F), runtime=bounded(one, recordings, settings), bank=replace(one.bank, reach=reach))
+
+    trials = [
+        (
+            complete(
+                observer_of(reduced(readout.without(group), orders[0]), fallback_of(blind.without(group), orders[1]))
+            ),
+            unseen,
+        )
+        for group, unseen in readout.left_out_groups()
+    ]
+    observer = complete(observer)
+    assert observer.bank is not None
+    bank = with_gaps(observer.bank, trials, F, settings)
+    observer, states = replace(observer, bank=bank), lifting.states
 
     def by_state(values: Array) -> dict[str, float]:
         return dict(zip(states, values.tolist(), strict=True))
@@ -117,7 +131,7 @@ def identify_estimator(
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
         "left_out_worst_percent": by_state(100 * worst),
         "outside_models_percent": by_state(outside_percent(readout, lifting)),
-        "settle_samples": settle_samples(systems, bank.recovery),
+        "settle_samples": settle_samples((filters, fallback), bank.recovery),
     }
     return Identified(observer, readout, facts)
 
@@ -239,6 +253,13 @@ def assembled(
         own_values,
         bank=gaps,
     )
+
+
+def let_go(observer: Observer, F: Array) -> Observer:
+    """Return an observer whose distance from the estimates of inputs alone decays by F (n, n)."""
+    A, last = observer.A.copy(), slice(observer.lifting.n_states - len(F), observer.lifting.n_states)
+    A[last, last] = F
+    return replace(observer, A=A)
 
 
 def settle_samples(systems: Sequence[Filters], recovery: Array) -> int:

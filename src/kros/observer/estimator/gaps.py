@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -16,13 +17,13 @@ from .settings import EstimatorSettings
 
 _NEVER = 1e12  # samples: an age that no gap has
 _ROWS = 1000  # samples at a time
-Signals = tuple[Array, Array, Array, Parameters]
 
 
-def training(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> Signals:
+def training(
+    observer: Observer, recordings: Recordings, samples: int, patterns: int
+) -> tuple[Array, Array, Array, Parameters]:
     """Return states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
-    samples = settings.gap_samples
-    length = min(min(recordings.lengths), samples // settings.gap_episodes)
+    length = min(min(recordings.lengths), samples // patterns)
     count = samples // length
     batches = [recordings.read(key).head(length) for key in recordings.some(count).keys]
     again = np.arange(count) % len(batches)  # every episode is seen with several losses
@@ -74,37 +75,52 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
     return missing
 
 
-def with_gaps(observer: Observer, signals: Signals, length: float, F: Array, settings: EstimatorSettings) -> FilterBank:
-    """Return a filter bank with the ages of gaps that minimise its errors under simulated losses in training.
+def with_gaps(
+    bank: FilterBank, trials: Sequence[tuple[Observer, Recordings]], F: Array, settings: EstimatorSettings
+) -> FilterBank:
+    """Return a filter bank with the ages of gaps that minimise the errors of trials under simulated losses.
 
-    Errors count by their logarithms, so that gaps of all lengths do. Gaps of all measurements and, of several, gaps of
-    some have ages of their own. Measured states have none: their substitutes are near the fallback always.
+    Errors count by their logarithms, so that gaps of all lengths do; trials do not know their recordings. Gaps of all
+    measurements and, of several, gaps of some have ages of their own. Measured states have none: their substitutes are
+    near the fallback always.
     """
-    bank, measured, (states, y, inputs, own) = observer.bank, list(observer.measured), signals
-    assert bank is not None
-    hidden = [i for i in range(len(F)) if i not in measured]
+    n, q = len(F), len(trials[0][0].measured)
+    hidden = [i for i in range(n) if i not in trials[0][0].measured]
     half, recovery = np.full(bank.half.shape, _NEVER), np.zeros(bank.half.shape)
-    rng, longest, q = np.random.default_rng(settings.seed), settings.longest(length), len(measured)
+    if not hidden:
+        return replace(bank, half=half, recovery=recovery)
+    rng = np.random.default_rng(settings.seed)
+    longest = settings.longest(float(np.median([recordings.length for _, recordings in trials])))
     ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
-    without = replace(observer, bank=replace(bank, half=half.copy(), recovery=recovery.copy()))
-    for kind in range(len(half) if hidden else 0):
+    errors = np.zeros((len(half), len(T), len(hidden)))
+    for (trial, recordings), kind in product(trials, range(len(half))):
+        samples, patterns = (-(-each // len(trials)) for each in (settings.gap_samples, settings.gap_episodes))
+        states, y, inputs, own = training(trial, recordings, samples, patterns)
         lost, sensors = losses(rng, *y.shape[:2]), np.ones(y.shape[1:], dtype=bool)
         if kind:
             sensors = rng.permuted(np.arange(q) < rng.integers(1, q, (len(sensors), 1)), axis=1)
+        assert trial.bank is not None
+        side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
         shown = np.where(lost[..., None] & sensors, np.nan, y)
-        filtered, from_inputs = np.split(recorded_estimates(without, shown, inputs, own), 2, axis=-1)
-        filtered[..., measured] = states[..., measured]
+        filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
+        filtered[..., list(trial.measured)] = states[..., list(trial.measured)]
         squares = blended_errors(states, filtered, from_inputs, lost, F, hidden, T, mu)
-        choice = np.log(np.maximum(squares, TINY)).mean(axis=1).argmin(axis=0)
-        half[kind, hidden], recovery[kind, hidden] = T[choice, 0], mu[choice, 0]
+        errors[kind] += np.log(np.maximum(squares, TINY)).mean(axis=1)
+    choice = errors.argmin(axis=1)
+    half, recovery = half.copy(), recovery.copy()
+    half[:, hidden], recovery[:, hidden] = T[choice, 0], mu[choice, 0]
     return replace(bank, half=half, recovery=recovery)
 
 
-def distances(observer: Observer, signals: Signals, held: Sequence[int]) -> tuple[Array, Array]:
+def distances(
+    observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]
+) -> tuple[Array, Array]:
     """Return by which matrix distances from estimates of inputs alone decay, and their RMS; `held` have no decay."""
-    n, at, (states, y, inputs, own) = len(observer.recorded), list(observer.measured), signals
-    apart = states - recorded_estimates(observer, y, inputs, own)[..., n:]
+    n, at = len(observer.recorded), list(observer.measured)
+    states, y, inputs, own = training(observer, recordings, settings.gap_samples, settings.gap_episodes)
+    from_inputs = recorded_estimates(observer, y, inputs, own)[..., n:]
+    apart = states - from_inputs
     F = decay(apart, [i for i in range(n) if i not in at] or at)
     F[held], F[:, held] = 0.0, 0.0
     return F, np.sqrt(np.mean(apart**2, axis=(0, 1)))

@@ -10,13 +10,14 @@ coefficients that know neither the unit nor its episodes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from ...core import EPS, ROUNDING, AnyArray, Array, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
-from .rows import Design, Group, Sample
+from .rows import Design, Group, Recordings, Sample
 
 Candidate = tuple[float, float, float]  # penalty, and weights of starts elsewhere and of restarts
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
@@ -145,7 +146,7 @@ class Readout:
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
     penalties: Array  # (n, 3), and weights of starts elsewhere and of restarts
-    others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
+    others: dict[Group, Array]  # coefficients (p, 2 n) that do not know a group, over the sizes
 
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Readout]:
@@ -168,22 +169,37 @@ class Readout:
         states, best = np.tile(np.arange(n), 2), moments.best(errors)
         coefficients = np.array(list(moments.solved(weights, candidates)))[best, :, states].T
         # What is left out took no part in the choice that it is judged with.
-        nested = [moments.best(errors, folds != fold if np.ptp(folds) else slice(None))[:n] for fold in folds]
+        nested = [moments.best(errors, folds != fold if np.ptp(folds) else slice(None)) for fold in folds]
         unaware = zip(others.items(), nested, strict=True)
         return cls(
             design,
             whitening.sample,
             whitening.directions @ coefficients * np.tile(design.recordings.size, 2),
-            np.array([errors[i, choice, range(n)] for i, choice in enumerate(nested)]),
+            np.array([errors[i, choice[:n], states[:n]] for i, choice in enumerate(nested)]),
             moments.errors(coefficients[:, :n]),
             np.array(candidates)[best[:n]],
-            {g: whitening.directions @ np.array(each)[choice, :, range(n)].T for (g, each), choice in unaware},
+            {g: whitening.directions @ np.array(each)[choice, :, states].T for (g, each), choice in unaware},
         )
+
+    def left_out_groups(self) -> list[tuple[Group, Recordings]]:
+        """Return a group of every fold, and the recordings of its fold and part: what `without` it does not know."""
+        groups, recordings, parts = self.design.groups, self.design.recordings, self.design.settings.parts
+        found = []
+        for fold in dict.fromkeys(group.fold for group in self.others):
+            of_fold = [group for group in self.others if group.fold == fold]
+            chosen = min(of_fold, key=lambda group: (group.part - group.fold) % parts)
+            same = [(groups[key].fold, groups[key].part) == (fold, chosen.part) for key in recordings.keys]
+            found.append((chosen, recordings.only(same)))
+        return found
 
     @property
     def typical(self) -> Array:
         """Typical left-out error of every state over its size, shape (n,)."""
         return np.exp(np.log(self.left_out).mean(axis=0) / 2)
+
+    def without(self, group: Group) -> Readout:
+        """Return the readout that does not know a group."""
+        return replace(self, coefficients=self.others[group] * np.tile(self.design.recordings.size, 2))
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
@@ -194,7 +210,8 @@ class Readout:
         """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
         design, found = self.design, []
         for key, rows, targets, weights in design.rows(design.recordings, design.settings.rows):
-            found.append(np.average((targets - rows @ self.others[design.groups[key]]) ** 2, axis=0, weights=weights))
+            errors = targets - rows @ self.others[design.groups[key]][:, : targets.shape[1]]
+            found.append(np.average(errors**2, axis=0, weights=weights))
         return np.array(found)
 
 

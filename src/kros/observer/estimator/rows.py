@@ -100,7 +100,10 @@ class Recordings:
             members.setdefault((groups or {}).get(key), []).append(key)
         share = min(1.0, count / len(self.keys))
         kept = {key for keys in members.values() for key in spread(keys, max(1, round(share * len(keys))))}
-        which = [key in kept for key in self.keys]
+        return self.only([key in kept for key in self.keys])
+
+    def only(self, which: Sequence[bool]) -> Recordings:
+        """Return the episodes that are flagged."""
         return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
 
 

@@ -127,11 +127,6 @@ def test_channels_late_by_different_numbers_are_refused():
         require_measured({"a": Sensor(delay_samples=1)}, ("a", "b"))
 
 
-def test_noise_of_the_synthesis_names_its_new_place(tmp_path):
-    with pytest.raises(ConfigError, match=r"\[sensor.position\] noise"):
-        validate_config({"data": {"source": "x"}, "synthesis": {"noise": {"position": 1e-6}}}, tmp_path)
-
-
 def observer(correction=0.2, delay=0):
     A, B = np.array([[1.0, DT], [0.0, 0.99]]), np.array([[0.0], [DT]])
     sensor, K = {"position": Sensor(noise=1e-3, delay_samples=delay)}, gain([[correction], [1.0]], DT)

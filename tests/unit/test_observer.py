@@ -21,7 +21,7 @@ def test_estimates_have_names_and_are_arrays():
     assert [estimate[name] for name in running.states] == np.asarray(estimate).tolist() == list(estimate.values())
     assert np.asarray(estimate, dtype=np.float32).dtype == np.float32
     assert repr(estimate).startswith("Estimate(position=")
-    assert repr(o).startswith("<Observer koopman/test: position, velocity, current")
+    assert repr(o).startswith("<Observer: name koopman/test, states position, velocity, current")
     np.testing.assert_array_equal(estimate, o.start([0.5], {"phase": 1.2}).step([0.4], [1.0, 2.0]))
     np.asarray(estimate)[:] = 0.0  # what is done to it leaves the observer alone
     running.step([0.4], [1.0, 2.0])

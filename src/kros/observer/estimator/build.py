@@ -127,6 +127,7 @@ def identify_estimator(
     worst = np.sqrt(readout.episode_errors().max(axis=0))
     facts = {
         "channels": family,
+        "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
         "left_out_worst_percent": by_state(100 * worst),

@@ -78,11 +78,11 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
 def with_gaps(
     bank: FilterBank, trials: Sequence[tuple[Observer, Recordings]], F: Array, settings: EstimatorSettings
 ) -> FilterBank:
-    """Return a filter bank with the ages of gaps that minimise the errors of trials under simulated losses.
+    """Return a filter bank with the ages of gaps that suit all simulated losses of trials best.
 
-    Errors count by their logarithms, so that gaps of all lengths do; trials do not know their recordings. Gaps of all
-    measurements and, of several, gaps of some have ages of their own. Measured states have none: their substitutes are
-    near the fallback always.
+    Errors count by their ratios to the least of any ages in the same loss, by mean squares of logarithms, so that gaps
+    of all lengths do; trials do not know their recordings. Gaps of all measurements and, of several, gaps of some have
+    ages of their own. Measured states have none: their substitutes are near the fallback always.
     """
     n, q = len(F), len(trials[0][0].measured)
     hidden = [i for i in range(n) if i not in trials[0][0].measured]
@@ -106,7 +106,8 @@ def with_gaps(
         filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
         filtered[..., list(trial.measured)] = states[..., list(trial.measured)]
         squares = blended_errors(states, filtered, from_inputs, lost, F, hidden, T, mu)
-        errors[kind] += np.log(np.maximum(squares, TINY)).mean(axis=1)
+        logs = np.log(np.maximum(squares, TINY))
+        errors[kind] += ((logs - logs.min(axis=0)) ** 2).mean(axis=1)
     choice = errors.argmin(axis=1)
     half, recovery = half.copy(), recovery.copy()
     half[:, hidden], recovery[:, hidden] = T[choice, 0], mu[choice, 0]

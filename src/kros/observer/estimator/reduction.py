@@ -11,7 +11,7 @@ What remains runs in the coordinates of its modes, where A is block diagonal: tw
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import replace
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -35,6 +35,7 @@ class Filters:
     C: Array  # (n, r)
     D: Array  # (n, channels)
     S: Array  # (r, channels)
+    singular_values: Array = field(default_factory=lambda: np.zeros(0))  # before reduction, over errors of estimates
 
     def first(self, order: int) -> Filters:
         """Return the first states alone."""
@@ -95,7 +96,7 @@ def reduced(readout: Readout, order: int | None = None) -> Filters:
     _, sigma, V = np.linalg.svd(readout.sample / size @ L.T, full_matrices=False)
     scale = np.maximum(sigma, EPS * sigma[:1])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
-    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S)
+    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
     if order is not None:
         return whole.first(order).modal()
     signals = design.sample_signals(_EPISODES, round(10 * max([*design.bank.lags, design.bank.delays])))

@@ -19,13 +19,13 @@ from ...core.arrays import Texts
 from ..measures import split_header
 from ..population import EpisodeKey, Population, Role
 from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder
-from ..readers.tables import Table
+from ..readers.tables import Table, stretches
 from ..recording import CHECK, some, usable
 from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
-from .roles import UNKNOWN, ColumnPart, Samples, TableColumn, describe, propose, time_columns, time_scale
+from .roles import UNKNOWN, ColumnPart, Samples, TableColumn, describe, label_columns, propose, time_columns, time_scale
 
 
 @dataclass(frozen=True)
@@ -128,20 +128,32 @@ def _columns(
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
     columns = describe(head)
     numeric = [c for c in columns if head.is_numeric(c.at)]
-    samples = _sampled(source, tables, numeric)
+    table, samples = _sampled(source, tables, numeric)
+    candidates, labels = time_columns(numeric, samples), Texts()
+    if period_s is None and not candidates:
+        labels = label_columns(table)  # of several episodes in a file
+    if labels:
+        texts = [table.texts(table.fields.index(label)) for label in labels.values()]
+        episodes = [rows for _, rows in stretches(texts)][: RULE.sampled]
+        samples = {at: [signals[0][rows] for rows in episodes] for at, signals in samples.items()}
+        candidates = time_columns(numeric, samples)
     known, keys, notes = dict[int, TableColumn](), Record(sample_period_s=period_s), Texts()
     if period_s is None:
-        time, keys, notes = _time(source, head, columns, time_columns(numeric, samples), samples)
+        time, keys, notes = _time(source, head, columns, candidates, samples)
         known[time.at] = replace(time, part=ColumnPart.TIME)
+    keys |= {"labels": labels} if labels else {}
+    for column in columns:
+        if column.header in labels.values():
+            known[column.at] = replace(column, why="says which unit, condition or episode a row belongs to")
     proposed = propose([c for c in numeric if c.at not in known], samples)
     known = {c.at: c for c in proposed} | known
     return [known.get(c.at, replace(c, why="no numbers")) for c in columns], keys, notes
 
 
-def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColumn]) -> Samples:
-    """Return columns of some tables that can be read; what cannot be used is NaN."""
+def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColumn]) -> tuple[Table, Samples]:
+    """Return the first table that can be read, and columns of some that can; what cannot be used is NaN."""
     spread = tables[:: max(1, len(tables) // RULE.sampled)]
-    places, samples = [c.at for c in columns], list[Array]()
+    places, samples = [c.at for c in columns], dict[Table, Array]()
     for table in dict.fromkeys((*spread, *tables)):
         if len(samples) == len(spread):
             break
@@ -150,11 +162,11 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColum
             if len(values) >= CHECK.samples:
                 known = np.where(usable(values), values, np.inf)
                 first = np.append(True, (known[1:] != known[:-1]).any(axis=1))  # the others repeat the row before
-                samples.append(np.where(np.isfinite(known), known, np.nan)[first].T)
+                samples[table] = np.where(np.isfinite(known), known, np.nan)[first].T
     if not samples:
         tables[0].numbers(places)  # says why not, where it cannot be read
         raise DataError(f"Looking at {source}: the files have fewer than three rows of numbers; check the folder.")
-    return {at: [signals[i] for signals in samples] for i, at in enumerate(places)}
+    return next(iter(samples)), {at: [signals[i] for signals in samples.values()] for i, at in enumerate(places)}
 
 
 def _time(

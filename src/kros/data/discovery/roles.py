@@ -11,12 +11,19 @@ import numpy as np
 from ...core import Array, frozen
 from ..measures import ZERO_OF_CELSIUS, Measure, clean_unit, identifier, kind_of, measure, split_header, words_of
 from ..readers.parquet import KEYS
-from ..readers.tables import Table
+from ..readers.tables import Table, stretches
 
 UNKNOWN = "not recognised"
 Samples = Mapping[int, Sequence[Array]]  # of columns by their place, from several episodes
 _STATES = ["angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration"]
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
+
+LABELS = {
+    "unit": "unit name device machine motor drive rig sample specimen cell dut uut asset maschine geraet",
+    "condition": "condition mode zustand",
+    "episode": "episode run trial test experiment cycle repetition measurement versuch messung lauf",
+}
+NUMBERS = {"id", "no", "nr", "number", "serial", "sn", "seriennummer"}  # of a unit, whatever it is, if of nothing else
 
 
 class ColumnPart(str, Enum):
@@ -133,3 +140,16 @@ def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
     if column.kind in _STATES:
         return ColumnPart.STATE, f"{column.kind}, by name or unit"
     return ColumnPart.LEFT_OUT, UNKNOWN
+
+
+def label_columns(table: Table) -> dict[str, str]:
+    """Return the columns whose names and values, which change now and then in a file, say that they label rows."""
+    labels = dict[str, str]()
+    for field in table.fields:
+        words = set(identifier(f"{field} ").lower().split("_"))
+        named = (role for role, known in LABELS.items() if set() < words - NUMBERS <= set(known.split()))
+        role = next(named, "unit" if words & NUMBERS else None)
+        rows = [rows for _, rows in stretches([table.texts(table.fields.index(field))])] if role else []
+        if role and 1 < len(rows) < rows[-1].stop / 10:
+            labels.setdefault(role, field)
+    return labels

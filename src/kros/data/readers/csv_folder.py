@@ -235,7 +235,9 @@ def read_csv_folder(
                 continue
             if key in places:
                 twice = f"{key} is in {places[key].table.path} and in {path}"
-                raise DataError(f"Duplicate episodes: {twice}; name more groups in files, or remove one.")
+                raise DataError(
+                    f"Duplicate episodes: {twice}; name more groups in files, name columns in labels, or remove one."
+                )
             places[key], group = place, named.get("group", "")
             if groups.setdefault(key.unit, group) != group:
                 raise DataError(f"Unit {key.unit} is in both groups {groups[key.unit]!r} and {group!r} ({path}).")

@@ -398,7 +398,7 @@ def report(run_folder: Run) -> None:
 
 
 @app.command()
-def figures(run_folder: Run, out: Path) -> None:
+def figures(run_folder: Run, out: Annotated[Path, _argument("OUT")]) -> None:
     """Write the report's figures as PNG and PDF."""
     from .study.stages.report import write_figures
 

@@ -172,7 +172,7 @@ def _of_units(facts: Facts) -> Checks:
         text = f"Flagged as not belonging to the batch: {units_text(flagged)}."
         yield text, "Inspect these units before they are shipped.", "units"
     actions = {
-        "not enough data": "Record longer.",
+        "not enough data": "Record longer; the table of units says for how long.",
         "cannot tell": "Score against more units in one condition, at least 8, that are more alike.",
     }
     for status, action in actions.items():

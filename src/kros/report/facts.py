@@ -16,7 +16,7 @@ import numpy as np
 from ..core import ByName, Names, frozen, grouped
 from ..data import natural_key
 from ..design.task import split_name
-from .names import number, observer_label, readable_unit, words
+from .names import in_condition, number, observer_label, readable_unit, words
 
 Rows = Sequence[ByName]
 _CELL = ("condition", "observer", "channel")
@@ -152,6 +152,11 @@ class Facts:
         rows = [r for r in self.get("evaluation") if r["role"] in ("nominal", "off_nominal")]
         others = [r for r in rows if r["role"] == "off_nominal"] or rows
         return self.tables_of(others, self.get("intervals"))
+
+    @property
+    def home(self) -> str:
+        """The condition of the errors that come first, as a part of a sentence; nothing where it is the only one."""
+        return in_condition(self.table.condition) if len(self.tables) > 1 else ""
 
     @property
     def table(self) -> ErrorTable:

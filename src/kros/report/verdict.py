@@ -116,7 +116,8 @@ def _numbers(facts: Facts) -> list[Number]:
                 lag_s = known.get("true_lag_s", 0.0)
                 lag = f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}" if lag_s else ""
                 notes.append(f"against the true signal: {number(error)} %{lag}")
-            numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
+            label = f"error of {words(channel)}{facts.home}"
+            numbers.append(Number(number(cell.mean), "% of the largest value", label, notes))
     if rows := facts.get("outliers"):
         flagged, open_ = sorted({r["unit"] for r in rows if r["outlier"]}), undecided(rows)
         notes = [some(flagged) or "none", *([f"UNDECIDED: {len(open_)} of {len(rows)} scores"] if open_ else [])]

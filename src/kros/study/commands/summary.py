@@ -50,7 +50,7 @@ def ranking(facts: Facts) -> list[str]:
     for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
         means = {channel: cell.shown for channel, cell in table.cells[name].items()}
         rows.append((f"{name}{'  <- deployed' if name == facts.deployed else ''}", *map(means.get, hidden)))
-    title = "observers by mean error on held-out episodes, percent of the largest value:"
+    title = f"observers by mean error on held-out episodes{facts.home}, percent of the largest value:"
     return [title, *aligned([("", *hidden), *rows])] if rows else []
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import kros
-from kros.identify.likeness import apart, moments, unlike
+from kros.identify.likeness import apart, course, moments, odd, unlike
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +105,16 @@ def test_a_sensor_that_fails_for_a_while_is_named_with_its_episode(motors) -> No
     _, stuck, code = kros.identify(found, refine=False).facts.alerts  # and the size of its position
     assert stuck.startswith(f"Episode 1 of unit {motors.unit_ids[1]} (default): velocity stays the same for 40 % of it")
     assert code.startswith(f"Episode 0 of unit {motors.unit_ids[2]} (default): position jumps by ")
+
+
+@pytest.mark.parametrize("turn", [2 * np.pi, 360.0])
+def test_a_wrapped_angle_is_named(turn: float) -> None:
+    t = np.arange(3000) * 1e-3
+    angle = turn * (3 * t + 0.4 * np.sin(4 * t))
+    wrapped, levels = angle % turn - turn / 2, turn * np.round(np.random.default_rng(0).random(3000))
+    courses = np.array([course(np.column_stack([angle, wrapped, levels, np.sign(np.sin(t))]))] * 2)
+    (text,) = odd(["Episode 1", "Episode 2"], ["angle", "wrapped", "levels", "sign"], courses)
+    assert text.startswith("Episode 1: wrapped jumps by a full turn, in 2 episodes, as a wrapped angle")
 
 
 def test_a_unit_that_is_moved_less_is_not_doubted(motors) -> None:

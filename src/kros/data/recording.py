@@ -39,6 +39,8 @@ class CheckRule:
     usual: float = 0.9  # share of the middle unit's episodes in which a correlation has its sign, to be a usual one
     held: float = 0.2  # share of an episode in which a state stays the same, from which on its sensor is doubted
     jump: float = 2.0  # change of a state between two samples, in ranges of most of them, beyond which it is doubted
+    turn: float = 1 / 16  # of a full turn: the largest step of a channel that is doubted to be a wrapped angle
+    step: float = 0.95  # quantile of the changes of a channel from sample to sample, which is its step
     constant: float = ROUNDING  # of the largest value: what filters and scales make of a constant
 
 

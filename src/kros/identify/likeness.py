@@ -18,10 +18,10 @@ def moments(values: Array) -> Array:
 
 
 def course(values: Array) -> Array:
-    """Return four numbers of every channel of an episode (n_samples, c), shape (4, c).
+    """Return five numbers of every channel of an episode (n_samples, c), shape (5, c).
 
     They are the longest share of the episode in which it stays the same while another channel moves by half of its
-    span, its largest change from one sample to the next, and between which values 98 % of its samples are.
+    span, its largest change from one sample to the next, between which values 98 % of its samples are, and its step.
     """
     shares, far = np.zeros(values.shape[1]), np.ptp(values, axis=0) / 2
     for i, column in enumerate(values.T):
@@ -30,13 +30,16 @@ def course(values: Array) -> Array:
         part = values[ends[longest] : ends[longest + 1]]
         if (np.ptp(part, axis=0) > far).any():
             shares[i] = len(part) / len(values)
-    low, high = np.quantile(values, (0.01, 0.99), axis=0)
-    return np.array([shares, np.abs(np.diff(values, axis=0)).max(axis=0), low, high])
+    changes, (low, high) = np.abs(np.diff(values, axis=0)), np.quantile(values, (0.01, 0.99), axis=0)
+    return np.array([shares, changes.max(axis=0), low, high, np.quantile(changes, CHECK.step, axis=0)])
 
 
 def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> list[str]:
-    """Return a sentence for every state that stays the same, or jumps, unlike in most episodes, (episodes, 4, n)."""
-    shares, jumps, low, high = np.swapaxes(courses, 0, 1)
+    """Return a sentence for every state that stays the same, or jumps, unlike in most episodes, (episodes, 5, n).
+
+    And for every state that jumps by a full turn in rad or deg.
+    """
+    shares, jumps, low, high, steps = np.swapaxes(courses, 0, 1)
     spans = high - low
     held = (shares > CHECK.held) & (shares > CHECK.ratio * np.median(shares, axis=0))
     size = np.maximum(spans, np.median(spans, axis=0))
@@ -45,13 +48,20 @@ def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> lis
     ]
     far = np.argwhere((jumps > CHECK.jump * size) & (size > 0))
     found += [(i, k, f"jumps by {jumps[i, k] / size[i, k]:.3g} times its range between two samples") for i, k in far]
-    return [f"{episodes[i]}: {channels[k]} {what}; if its sensor failed, leave it out." for i, k, what in found]
+    texts = [f"{episodes[i]}: {channels[k]} {what}; if its sensor failed, leave it out." for i, k, what in found]
+    turns = [(np.abs(jumps - turn) <= steps) & (steps < CHECK.turn * turn) for turn in (2 * np.pi, 360.0)]
+    wrapped = np.any(turns, axis=0) & (spans <= jumps + steps)
+    for channel, of in zip(channels, wrapped.T, strict=True):
+        if of.any():
+            where = f"{episodes[int(of.argmax())]}: {channel} jumps by a full turn, in {of.sum()} episodes"
+            texts.append(f"{where}, as a wrapped angle; unwrap it first, as numpy.unwrap does.")
+    return texts
 
 
 def apart(channels: Sequence[str], units: Mapping[str, Array]) -> list[str]:
     """Return a sentence for every channel of a unit whose values are beyond those of all others, which are alike.
 
-    Units have the courses of their episodes, (episode, 4, c).
+    Units have the courses of their episodes, (episode, 5, c).
     """
     lows = np.array([of[:, 2].min(axis=0) for of in units.values()])
     highs = np.array([of[:, 3].max(axis=0) for of in units.values()])

@@ -168,17 +168,32 @@ class ProcessExecutor(Executor):
     def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Yield results in the order of the tasks, whose work begins at once."""
         tasks = list(tasks)
-        return _results(self.pool.map(function, tasks, chunksize=max(1, len(tasks) // _CHUNKS)))
+        chunks = [tasks[part] for part in pieces(len(tasks), max(1, len(tasks) // _CHUNKS))]
+        return _results(deque(self.pool.submit(_each, function, chunk) for chunk in chunks))
 
 
-def _results(results: Iterator[T]) -> Iterator[T]:
+def _each(function: Callable[[Any], T], tasks: Sequence[Any]) -> list[T]:
+    """In a worker: run a chunk of tasks."""
+    return [function(task) for task in tasks]
+
+
+def _results(futures: deque[Any]) -> Iterator[Any]:
+    """Yield results of chunks; where a task fails, those that have not begun are not begun.
+
+    Where the run itself is stopped, they end with the pool: Python 3.11 has a traceback for those that were cancelled.
+    """
     from concurrent.futures.process import BrokenProcessPool
 
     try:
-        yield from results
+        while futures:
+            yield from futures.popleft().result()
     except BrokenProcessPool as error:
         reason = 'memory ran out, or a script that asks for workers has no `if __name__ == "__main__":` in it'
         raise KrosError(f"A worker process ended: {reason}. Run again with fewer workers, or add that.") from error
+    except Exception:
+        for future in futures:
+            future.cancel()
+        raise
 
 
 @contextmanager

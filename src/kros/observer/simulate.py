@@ -123,9 +123,8 @@ class Course:
         self.settling = np.zeros(batch, dtype=int)  # samples until a start has settled
         self.since = np.full(batch, -1, dtype=np.intp)  # samples since a start, at most the delay
         self.held: Held | None = None  # before the first sample
-        self.inputs = np.empty(
-            (0, batch, len(observer.inputs))
-        )  # of the last samples, as many as measurements are late
+        # of the last samples, as many as measurements are late
+        self.inputs = np.empty((0, batch, len(observer.inputs)))
 
     def ahead(self) -> Array:
         """Return the inputs that no measurement has met yet, (samples, batch, m), of machines that started at once."""

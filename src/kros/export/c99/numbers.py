@@ -87,19 +87,13 @@ class Source:
 
     def context(self) -> Record:
         """Return what the templates name: the observer and its parts, names, sizes, and matrices."""
-        o, lifting, loop, factors, K = (
-            self.observer,
-            self.observer.lifting,
-            self.loop,
-            self.factors(),
-            self.observer.controller,
-        )
+        o, loop, factors = self.observer, self.loop, self.factors()
+        lifting, K = o.lifting, o.controller
         low, high = bounds(o.guard, lifting.n_states, K.n_states)
-        model, correction = (
-            np.hstack([o.A, o.B])[: lifting.n_states],
-            o.into[: lifting.n_states] @ np.hstack([K.C, K.D]),
-        )
-        controller, moving = np.hstack([K.A, K.B]), () if self.shift is None else self.shift.states[: len(o.recorded)]
+        model = np.hstack([o.A, o.B])[: lifting.n_states]
+        correction = o.into[: lifting.n_states] @ np.hstack([K.C, K.D])
+        controller = np.hstack([K.A, K.B])
+        moving = () if self.shift is None else self.shift.states[: len(o.recorded)]
         return {
             "o": o,
             "lifting": lifting,

@@ -21,7 +21,7 @@ from .channels import FAMILIES, channels_of
 from .gaps import distances, with_gaps
 from .reduction import Filters, reduced
 from .regression import Readout, is_less
-from .rows import Design, Recordings
+from .rows import Design, Group, Recordings
 from .settings import EstimatorSettings
 
 
@@ -105,15 +105,12 @@ def identify_estimator(
         reach[near] = settings.reach * apart[near]
         return replace(let_go(one, F), runtime=bounded(one, recordings, settings), bank=replace(one.bank, reach=reach))
 
-    trials = [
-        (
-            complete(
-                observer_of(reduced(readout.without(group), orders[0]), fallback_of(blind.without(group), orders[1]))
-            ),
-            unseen,
+    def trial(group: Group) -> Observer:
+        return complete(
+            observer_of(reduced(readout.without(group), orders[0]), fallback_of(blind.without(group), orders[1]))
         )
-        for group, unseen in readout.left_out_groups()
-    ]
+
+    trials = [(trial(group), unseen) for group, unseen in readout.left_out_groups()]
     observer = complete(observer)
     assert observer.bank is not None
     bank = with_gaps(observer.bank, trials, F, settings)

@@ -201,7 +201,7 @@ def test_left_out_errors_are_those_of_penalties_that_other_units_chose():
         recordings, settings=FEW.model_copy(update={"parts": 1, "rows": 1000, "sample": 1000, "gap_share": 1e-3})
     )
     (readout,), (moments,) = Readout.of([made]), Moments.of([made], [Whitening.of(made, made.sample())])
-    settings, weights = made.settings, condition_weights(moments)
+    settings, weights = made.settings, condition_weights(moments, made.settings.restart_share)
     candidates = [(penalty, 0.0, settings.settled_share) for penalty in settings.penalties]
     others, folds = moments.without(weights, candidates), moments.of_groups("fold")
     errors = np.array([[moments.errors(c)[i] for c in others[g]] for i, g in enumerate(moments.groups)])
@@ -236,7 +236,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     of_y = np.flatnonzero(bank.channel == 0)
     delays = bank.channels - 1 + np.arange(bank.delayed * (bank.delays - 1))
     moved = np.isin(np.arange(len(bank)), np.setdiff1d(of_y[: -len(bank.starts)], delays))  # and not the first sample
-    errors = design(biased, settings=FEW.model_copy(update={"gap_share": 0.0})).sample().errors
+    errors = design(biased).sample().errors
     np.testing.assert_allclose((errors.T @ errors)[moved][:, moved], 0.25, atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
@@ -453,9 +453,7 @@ def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well()
 
 
 @pytest.mark.parametrize("gap", [1, 20])
-def test_a_readout_of_its_own_counts_after_a_loss_as_long_as_the_gap_until_the_slowest_filter_has_forgotten(
-    motors, gap
-):
+def test_a_readout_of_its_own_counts_after_every_loss_until_the_slowest_filter_has_forgotten(motors, gap):
     observer, batch = motors
     y, n = batch.states[..., :1].copy(), observer.lifting.n_states
     y[300 : 300 + gap] = np.nan
@@ -467,8 +465,7 @@ def test_a_readout_of_its_own_counts_after_a_loss_as_long_as_the_gap_until_the_s
         one = replace(observer, A=A, B=B, bank=replace(observer.bank, half=np.full((1, 3), 1e12)))
         runs.append(run_observer(one, y, batch.inputs)[last + 3 :, :, 1])
     decay, oldest = observer.bank.start_recovery, 0.1 * np.exp(5)
-    lost = max(min(gap, oldest), oldest * float(decay[0]) ** last)
-    age = lost * decay ** np.arange(2, len(y) - last - 1)[:, None]
+    age = oldest * decay ** np.arange(2, len(y) - last - 1)[:, None]
     np.testing.assert_allclose(runs[0], runs[1] / (1 + age**2), atol=1e-9 * np.abs(runs[1]).max())
 
 

@@ -316,8 +316,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
         vec *start = gap + (ages + q) * MOST + v;
-        const vec since = clipped(longest, (vec){0}, (vec){0} + OLDEST);
-        *start = either(since > *start, since, *start);
+        *start = either(some & (*start < OLDEST), (vec){0} + OLDEST, *start);
         const vec begun = level(*start, (vec){0} + 1.0);
         *start *= bank[3 * ages * MOST + v];
         for (whole k = 0; k < s->kinds; k++) {

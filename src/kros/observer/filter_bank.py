@@ -19,8 +19,8 @@ have ages, T and :math:`\mu` of their own, and the larger m counts. The estimate
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
 After a start, what happened before is not known; after a loss, filters hold what stood for measurements. There
-:math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start and of the length of a
-gap, which falls as the slowest filter forgets. Limits of the estimates hold before the fallback enters them, so that
+:math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start and at every loss,
+which falls as the slowest filter forgets. Limits of the estimates hold before the fallback enters them, so that
 little of what is far away is left in long gaps.
 
 A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of
@@ -151,7 +151,7 @@ class Gaps:
         recovered = np.where(lost, self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
         self.age[...] = np.maximum(recovered, lengths)
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
-        disturbed = np.maximum(self.start, np.minimum(longest, OLDEST)[:, None])
+        disturbed = np.maximum(self.start, OLDEST * some[:, None])
         recorded += level(disturbed) * (following[:, self.after_start] - recorded)
         np.clip(recorded, *self.limits, out=recorded)
         recorded += self.hidden * self.share * (fallback - recorded)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 
@@ -20,10 +19,10 @@ _ROWS = 1000  # samples at a time
 
 
 def training(
-    observer: Observer, recordings: Recordings, samples: int, patterns: int
+    observer: Observer, recordings: Recordings, samples: int, patterns: int, longest: int
 ) -> tuple[Array, Array, Array, Parameters]:
     """Return states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
-    length = min(min(recordings.lengths), samples // patterns)
+    length = min(longest, samples // patterns)
     count = samples // length
     batches = [recordings.read(key).head(length) for key in recordings.some(count).keys]
     again = np.arange(count) % len(batches)  # every episode is seen with several losses
@@ -93,21 +92,26 @@ def with_gaps(
     longest = settings.longest(float(np.median([recordings.length for _, recordings in trials])))
     ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
+    samples, patterns = (-(-each // len(trials)) for each in (settings.gap_samples, settings.gap_episodes))
+    length = min(min(recordings.lengths) for _, recordings in trials)
+    seen = [training(trial, recordings, samples, patterns, length) for trial, recordings in trials]
     errors = np.zeros((len(half), len(T), len(hidden)))
-    for (trial, recordings), kind in product(trials, range(len(half))):
-        samples, patterns = (-(-each // len(trials)) for each in (settings.gap_samples, settings.gap_episodes))
-        states, y, inputs, own = training(trial, recordings, samples, patterns)
-        lost, sensors = losses(rng, *y.shape[:2]), np.ones(y.shape[1:], dtype=bool)
-        if kind:
-            sensors = rng.permuted(np.arange(q) < rng.integers(1, q, (len(sensors), 1)), axis=1)
-        assert trial.bank is not None
-        side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
-        shown = np.where(lost[..., None] & sensors, np.nan, y)
-        filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
-        filtered[..., list(trial.measured)] = states[..., list(trial.measured)]
+    for kind in range(len(half)):
+        runs = []
+        for (trial, _), (states, y, inputs, own) in zip(trials, seen, strict=True):
+            lost, sensors = losses(rng, *y.shape[:2]), np.ones(y.shape[1:], dtype=bool)
+            if kind:
+                sensors = rng.permuted(np.arange(q) < rng.integers(1, q, (len(sensors), 1)), axis=1)
+            assert trial.bank is not None
+            side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
+            shown = np.where(lost[..., None] & sensors, np.nan, y)
+            filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
+            filtered[..., list(trial.measured)] = states[..., list(trial.measured)]
+            runs.append((states, filtered, from_inputs, lost))
+        states, filtered, from_inputs, lost = (np.concatenate(each, axis=1) for each in zip(*runs, strict=True))
         squares = blended_errors(states, filtered, from_inputs, lost, F, hidden, T, mu)
         logs = np.log(np.maximum(squares, TINY))
-        errors[kind] += ((logs - logs.min(axis=0)) ** 2).mean(axis=1)
+        errors[kind] = ((logs - logs.min(axis=0)) ** 2).mean(axis=1)
     choice = errors.argmin(axis=1)
     half, recovery = half.copy(), recovery.copy()
     half[:, hidden], recovery[:, hidden] = T[choice, 0], mu[choice, 0]
@@ -119,7 +123,9 @@ def distances(
 ) -> tuple[Array, Array]:
     """Return by which matrix distances from estimates of inputs alone decay, and their RMS; `held` have no decay."""
     n, at = len(observer.recorded), list(observer.measured)
-    states, y, inputs, own = training(observer, recordings, settings.gap_samples, settings.gap_episodes)
+    states, y, inputs, own = training(
+        observer, recordings, settings.gap_samples, settings.gap_episodes, min(recordings.lengths)
+    )
     from_inputs = recorded_estimates(observer, y, inputs, own)[..., n:]
     apart = states - from_inputs
     F = decay(apart, [i for i in range(n) if i not in at] or at)

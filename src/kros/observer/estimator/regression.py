@@ -160,7 +160,8 @@ class Readout:
     def _fitted(cls, design: Design, moments: Moments) -> Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = moments.whitening
-        weights, settings = condition_weights(moments), design.settings
+        settings = design.settings
+        weights = condition_weights(moments, settings.restart_share)
         pairs = (0.0, settings.settled_share), (settings.start_share, settings.restart_share)
         candidates = [(penalty, *pair) for penalty, pair in product(settings.penalties, pairs)]
         others = moments.without(weights, candidates)
@@ -222,10 +223,10 @@ def is_less(one: Array, other: Array, margin: float) -> bool:
     return bool(difference.mean() + margin * error < 0)
 
 
-def condition_weights(moments: Moments) -> Array:
+def condition_weights(moments: Moments, restart: float) -> Array:
     """Return weights of the groups: by rows within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
     alike = conditions[:, None] == conditions
-    (first,) = moments.solved(moments.rows, [(ROUNDING, 0.0, 1.0)])
+    (first,) = moments.solved(moments.rows, [(ROUNDING, 0.0, restart)])
     errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
     return moments.rows / (alike @ moments.rows) * alike.sum(axis=1) ** 2 / (alike @ errors)

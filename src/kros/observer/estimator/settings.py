@@ -69,12 +69,12 @@ class EstimatorSettings(Settings):
         gt=0,
         description="weight of the errors that a start in the middle of an episode makes, for the same time",
     )
-    settled_share: float = Field(1e-3, gt=0, description="weight of these errors for all other time")
+    settled_share: float = Field(3e-4, gt=0, description="weight of these errors for all other time")
     gap_share: float = Field(
         3e-3,
         ge=0,
-        description="weight of the errors that straight lines over lost measurements make, half of them: rows with "
-        "target zero, which bound the gains of filters on smooth recordings",
+        description="weight of the errors that straight lines over lost measurements make, half of them, for the time "
+        "after a start or a loss; less for all other time, as `settled_share` is less than `restart_share`",
     )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"

@@ -38,7 +38,7 @@ from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.engine.store import Store
 from kros.synthesis.problem.plants import mixed_plant
-from kros.synthesis.worst_case.certificate import certify
+from kros.synthesis.worst_case.certificate import certify_errors
 
 
 def main() -> None:
@@ -110,10 +110,9 @@ def solve(task: DesignTask) -> tuple[str, float, bool]:
         )
     wall, used = time.perf_counter() - wall, time.process_time() - start
     judge, found = task.training.read(), result.synthesis
-    nothing, _ = certify(
-        replace(task.problem, injection=result.synthesis.injection),
-        gain(np.zeros((task.models.lifting.n_lifted, len(task.models.measured))), task.models.sample_period_s),
-    )
+    problem, models = replace(task.problem, injection=found.injection), task.models
+    idle = gain(np.zeros((models.lifting.n_lifted, len(models.measured))), models.sample_period_s)
+    nothing, _ = certify_errors(problem, problem.error_system(idle))
     error, free = percent_of([result.observer, task.observer(task.open_loop())], judge)
     return (
         f"{n_states:2d} states, K {found.controller.n_states:2d} {found.status.value:10s} {used:6.2f} s ({wall:6.2f} s wall) "

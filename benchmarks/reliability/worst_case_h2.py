@@ -18,7 +18,7 @@ from campaign import Tally, main
 
 from kros.core import StateSpace, SynthesisError, gain, hinf_norm
 from kros.synthesis import Injection, ObserverProblem, Synthesis, worst_case_h2
-from kros.synthesis.worst_case.certificate import certify
+from kros.synthesis.worst_case.certificate import certify_errors
 from kros.uncertainty.forms import Form
 
 Array = npt.NDArray[Any]
@@ -222,7 +222,7 @@ def other_observers(
 def value_of(problem: ObserverProblem, K: StateSpace) -> float:
     """Certified value; infinite where there is none."""
     try:
-        return certify(problem, K)[0]
+        return certify_errors(problem, problem.error_system(K))[0]
     except SynthesisError:
         return np.inf
 

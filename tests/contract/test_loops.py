@@ -15,11 +15,11 @@ from machines import MACHINES, drive, samples
 
 from kros.core.errors import ConfigError
 from kros.export import export_fmu
-from kros.identify.free_run import free_run
+from kros.identify.free_run import free_run, recursion
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
-from kros.loops import compiler, library, recursion
+from kros.loops import compiler, library
 from kros.loops.compiler import find_compiler
 from kros.observer.simulate import run_innovations, run_observer
 
@@ -138,7 +138,7 @@ def test_free_runs_and_sensitivities_of_all_liftings_are_alike(family, both):
 def test_recursions_are_alike(both):
     rng = np.random.default_rng(4)
     F, driven = 0.9 * np.eye(5) + 0.02 * rng.normal(size=(5, 5)), rng.normal(size=(200, MACHINE_COUNT, 5))
-    assert_same(*both(lambda: [recursion(F, driven, driven[0])]))
+    assert_same(*both(lambda: [recursion(F, np.eye(5), driven[0], driven)]))
 
 
 SOURCE = "int kros_answer(void);\nint kros_answer(void) { return 42; }\n"

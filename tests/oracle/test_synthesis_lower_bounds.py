@@ -11,7 +11,7 @@ from kros.core import StateSpace, SynthesisError, block_diagonal, gain
 from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, worst_case_h2
 from kros.synthesis.result import enclosed
 from kros.synthesis.riccati.h2 import predictor_bound
-from kros.synthesis.worst_case.certificate import certify
+from kros.synthesis.worst_case.certificate import certify_errors
 from kros.synthesis.worst_case.members import mean, member, shifts
 
 DT = 1.0
@@ -69,7 +69,7 @@ def test_a_lightly_damped_population():
     """An open-loop observer guarantees 24.81, whatever the order of the shaping filters; the bound lies below, and is
     worth something."""
     case = stored("lightly_damped_population")
-    nothing = certify(case, gain(np.zeros((4, 1)), case.nominal.dt))[0]
+    nothing = certify_errors(case, case.error_system(gain(np.zeros((4, 1)), case.nominal.dt)))[0]
     assert nothing == pytest.approx(24.81, abs=0.005)
     found = worst_case_h2(case)
     assert found.worst_case_h2 <= nothing
@@ -128,7 +128,7 @@ def test_no_observer_is_below_the_bound(changes):
     assert 0.4 * found.worst_case_h2 < found.lower_bound <= found.worst_case_h2
     rng = np.random.default_rng(0)
     for K in others(case, found, rng):
-        assert certify(case, K)[0] >= found.lower_bound
+        assert certify_errors(case, case.error_system(K))[0] >= found.lower_bound
 
 
 def test_bound_of_a_white_set_is_the_kalman_optimum():

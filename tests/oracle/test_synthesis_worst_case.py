@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from kros.core import block_diagonal, gain
 from kros.synthesis import Injection, ObserverProblem, Status, worst_case_h2
 from kros.synthesis.worst_case.ball import Ball, dual_bound, spread
-from kros.synthesis.worst_case.certificate import certify, circle_mean, density
+from kros.synthesis.worst_case.certificate import certify_errors, circle_mean, density
 
 
 def problem(seed=0, injection=Injection.STATE, **changes):
@@ -188,7 +188,7 @@ def test_exact_when_the_set_is_a_scaled_identity():
 
     P = solve_discrete_are(A.T, C.T, (w / (1 - w)) ** 2 * B @ B.T, np.eye(1))
     L = np.linalg.solve(np.eye(1) + C @ P @ C.T, C @ P @ A.T).T
-    optimum = certify(case, case.to_physical(gain(L, DT)))[0]
+    optimum = certify_errors(case, case.error_system(case.to_physical(gain(L, DT))))[0]
     assert optimum == pytest.approx(np.sqrt(np.trace(W_p @ P @ W_p.T)), rel=1e-4)
     assert optimum <= found.worst_case_h2 <= 1.001 * optimum, "a design for the average spectrum, not the worst one"
     assert found.gap_percent < 0.05
@@ -202,5 +202,5 @@ def test_remainder_enters_bound_and_design():
     plain = worst_case_h2(without)
     found = worst_case_h2(case)
     assert found.worst_case_h2 > plain.worst_case_h2
-    assert found.worst_case_h2 <= certify(case, plain.controller)[0] * (1 + 1e-6)
+    assert found.worst_case_h2 <= certify_errors(case, case.error_system(plain.controller))[0] * (1 + 1e-6)
     assert found.lower_bound <= found.worst_case_h2

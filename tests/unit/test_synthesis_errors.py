@@ -19,7 +19,7 @@ from kros.synthesis import (
     mixed,
     worst_case_h2,
 )
-from kros.synthesis.worst_case.certificate import certify
+from kros.synthesis.worst_case.certificate import certify_errors
 
 DT = 1e-3
 
@@ -177,7 +177,7 @@ def test_problems_without_a_sound_answer_are_refused(method, changes, message):
 
 def test_certificate_refuses_an_unstable_observer():
     with pytest.raises(SynthesisError, match="spectral radius"):
-        certify(problem(), gain([[-1.0], [0.0]], DT))
+        certify_errors(problem(), problem().error_system(gain([[-1.0], [0.0]], DT)))
 
 
 def test_mixed_refuses_general_plants(one_state):

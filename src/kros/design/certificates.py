@@ -11,8 +11,7 @@ import numpy as np
 from ..core import TINY, Array, Record, StateSpace, SynthesisError, frozen, gain, grouped
 from ..data import EpisodeBatch
 from ..evaluate.errors import error_rms
-from ..identify import ModelSet
-from ..loops import recursion
+from ..identify.free_run import recursion
 from ..observer import Observer, ReliftScales, Screen, factors, one_step_residual
 from ..observer.certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from ..observer.certificate.signals import SignalBound, signal_bound
@@ -22,7 +21,6 @@ from ..observer.runtime import Guard
 from ..observer.simulate import run_observer, run_observers
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import certify_errors
-from ..uncertainty import UncertainModel
 from .monitor import settling
 from .task import Design, DesignTask
 from .training import TRAINING, hidden_mean, percent_of
@@ -45,8 +43,8 @@ DEFAULT = CertificateSettings()
 Parts = tuple[Guard | None, ReliftCertificate, SignalBound]
 
 
-def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
-    """Certify observers of one lifting; return them with guards and facts, certificates in the recordings' units."""
+def certify(task: DesignTask, designs: Sequence[Design]) -> list[tuple[Guard | None, ReliftCertificate, Record]]:
+    """Return guards, certificates and facts of observers of one lifting, certificates in the recordings' units."""
     batches, observers = certified_on(task), [design.observer for design in designs]
     bank = observers[0].bank is not None
     parts = (
@@ -57,14 +55,12 @@ def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
     growth = [design.facts.get("left_out_to_training", {}) for design in designs]
     by = np.array([[of.get(name, 1.0) for name in observers[0].recorded] for of in growth])
     errors = hidden_error_percent(observers, batches, by), loss_error_percent(observers, batches[0])
-    certified = []
-    for design, (guard, certificate, bound), *percents in zip(
-        designs, parts, *map(np.ndarray.tolist, errors), strict=True
-    ):
-        facts = {**design.facts, **_facts(certificate, bound, design.observer, percents)}
-        observer = replace(design.observer, guard=guard)
-        certified.append(replace(design, observer=observer, certificate=certificate, facts=facts))
-    return certified
+    return [
+        (guard, proof, _facts(proof, bound, observer, percents))
+        for observer, (guard, proof, bound), *percents in zip(
+            observers, parts, *map(np.ndarray.tolist, errors), strict=True
+        )
+    ]
 
 
 def certified_on(task: DesignTask) -> list[EpisodeBatch]:
@@ -187,7 +183,7 @@ def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> 
     corrections = []
     for o, estimate in zip(observers, x, strict=True):
         nu = np.where(inside & np.isfinite(y), y - estimate[..., q], 0.0)
-        states_c = recursion(o.controller.A, nu, np.zeros((nu.shape[1], o.controller.n_states)), o.controller.B)
+        states_c = recursion(o.controller.A, o.controller.B, np.zeros((nu.shape[1], o.controller.n_states)), nu)
         corrections.append(np.abs(states_c).max(axis=(0, 1), initial=0.0))
     return low, high, np.maximum(np.abs(least), np.abs(most)), corrections
 
@@ -200,17 +196,6 @@ def _guard(observer: Observer, low: Array, high: Array, correction: Array) -> Gu
     low[at], high[at] = np.minimum(low[at], screen.least[:q]), np.maximum(high[at], screen.most[:q])
     correction = (1 + 2 * DEFAULT.room) * np.maximum(correction, TINY)
     return Guard(low, high, correction, settling(observer))
-
-
-def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) -> tuple[ObserverProblem | None, str]:
-    """Return the synthesis problem of one kind of model, or None and why there is none."""
-    try:
-        problem = ObserverProblem.from_uncertain(models, uncertain, noise)
-        problem.require_sound()
-        return problem, ""
-    except SynthesisError as error:
-        log.warning("%s: no robust observers and no certificates for the set of plants: %s", models.name, error)
-        return None, str(error)
 
 
 def certificate(task: DesignTask, design: Design) -> Record:

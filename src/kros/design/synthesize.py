@@ -22,8 +22,9 @@ from ..data import scaling_of
 from ..identify import IdentifiedModels, ModelSet
 from ..observer import EstimatorSettings, Sensor, Sensors, require_measured
 from ..observer.units import in_sizes
-from ..uncertainty import UncertainModels
-from .certificates import certificate, certify, usable_problem
+from ..synthesis import ObserverProblem
+from ..uncertainty import UncertainModel, UncertainModels
+from .certificates import certificate, certify
 from .methods import METHODS, methods_of, preferred, suitable
 from .monitor import fit_monitor
 from .settings import ObserverSettings, SynthesisSettings
@@ -183,6 +184,17 @@ def tasks_of(
     return [task(f"{kind}/{m.name}", m) for m in suitable(methods, kind)]
 
 
+def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) -> tuple[ObserverProblem | None, str]:
+    """Return the synthesis problem of one kind of model, or None and why there is none."""
+    try:
+        problem = ObserverProblem.from_uncertain(models, uncertain, noise)
+        problem.require_sound()
+        return problem, ""
+    except SynthesisError as error:
+        log.warning("%s: no robust observers and no certificates for the set of plants: %s", models.name, error)
+        return None, str(error)
+
+
 def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Sensors) -> Array:
     """Return the standard deviation of every measurement's noise."""
     names, steps = [models.lifting.states[i] for i in models.measured], np.zeros(len(models.measured))
@@ -220,13 +232,13 @@ def certified(
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
     linear = [partial(certificate, task, design) for task, design in pairs]
     results: list[Any] = work.run("certify", [*nonlinear, *linear])  # the first ones take longest
-    by_name = {design.name: design for design in chain(*results[: len(nonlinear)])}
-    final = {}
-    for (task, _), facts in zip(pairs, results[len(nonlinear) :], strict=True):
-        design = by_name[task.name]
-        observer = in_sizes(design.observer, {})  # in the recordings' units
+    names = (task.name for task, _ in chain(*groups.values()))
+    parts, final = dict(zip(names, chain(*results[: len(nonlinear)]), strict=True)), {}
+    for (task, design), of_set in zip(pairs, results[len(nonlinear) :], strict=True):
+        guard, proof, known = parts[task.name]
+        observer = in_sizes(replace(design.observer, guard=guard), {})  # in the recordings' units
         solved = replace(design.synthesis, controller=observer.controller)
-        design = replace(design, observer=observer, synthesis=solved, facts={**design.facts, **facts})
+        design = Design(design.name, observer, solved, {**design.facts, **known, **of_set}, proof)
         final[task.name] = replace(design, observer=replace(observer, about=about(task, identified, design)))
     return final
 

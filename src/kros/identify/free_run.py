@@ -1,4 +1,4 @@
-"""Simulation of lifted models from a first state and recorded inputs alone, retracted and re-lifted at every step.
+"""Simulation of models from a first state and inputs alone, lifted ones retracted and re-lifted at every step.
 
 The definition is the *local error* of the paper's section III: the lifted state always has the structure of a lifting.
 """
@@ -78,3 +78,11 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Arra
             window[:, n:] = lifting.window.advance(window, u[:, k])
             window[:, :n] = (rows @ np.concatenate([lifted, inputs], axis=1)[..., None])[..., 0]
     return states
+
+
+def recursion(A: Array, B: Array, first: Array, u: Array) -> Array:
+    """Return ``x[k + 1] = A x[k] + B u[k]``, shape (n_samples, batch, n), from u (n_samples, batch, m)."""
+    if not len(A):
+        return np.zeros((*u.shape[:2], 0))
+    states = Lifting(tuple(f"x{i}" for i in range(len(A))))
+    return free_run(A, B, states, {}, first, u.swapaxes(0, 1)).swapaxes(0, 1)

@@ -7,6 +7,6 @@ none, the callers go on in NumPy, which is also what tests compare with.
 
 from __future__ import annotations
 
-from .library import Library, formulas, library, recursion
+from .library import Library, formulas, library
 
-__all__ = ["Library", "formulas", "library", "recursion"]
+__all__ = ["Library", "formulas", "library"]

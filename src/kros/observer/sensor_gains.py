@@ -15,7 +15,7 @@ import numpy as np
 
 from ..core import AGREED, Array, StateSpace
 from ..core.norms import gramian
-from ..loops import recursion
+from ..identify.free_run import recursion
 from .data import ObserverData
 
 BLOCK = 4096  # samples of an impulse response that are in memory
@@ -58,7 +58,7 @@ def _bounded(system: StateSpace) -> Array:
     """Return the sums of absolute impulse responses, shape (n, q)."""
     x, total, still = system.B.T, np.abs(system.D.T), np.zeros((BLOCK, system.n_inputs, system.n_inputs))
     while True:
-        states = recursion(system.A, still, x, system.B)
+        states = recursion(system.A, system.B, x, still)
         added = np.abs(states @ system.C.T).sum(axis=0)
         total, x = total + added, states[-1] @ system.A.T
         if np.all(added <= AGREED * total):

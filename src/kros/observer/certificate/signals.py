@@ -19,7 +19,7 @@ import numpy as np
 
 from ...core import AGREED, TINY, Array, Flags, Names, Parameters, Record, frozen
 from ...data import EpisodeBatch
-from ...loops import recursion
+from ...identify.free_run import recursion
 from ..data import ObserverData
 from ..residual import one_step_residual
 from ..screen import screened
@@ -99,7 +99,7 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
 def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array, Array]:
     """Return the scaled errors and what the slopes act on, (n_samples, batch, .), with slopes in the middle."""
     w = np.concatenate([w, np.zeros((1, *w.shape[1:]))])
-    xi = recursion(system.A, w, first @ system.start.T, system.B)
+    xi = recursion(system.A, system.B, first @ system.start.T, w)
     return xi @ system.C.T, xi @ system.M.T + w @ system.D.T
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from ...core import EPS, Array, frozen
 from ...core.linalg import balanced_size
 from ...core.norms import gramian_root
-from ...loops import recursion
+from ...identify.free_run import recursion
 from .channels import Channels
 from .regression import Readout
 
@@ -69,7 +69,7 @@ class Filters:
 
     def along(self, v: Array) -> Array:
         """Return the estimates of signals v (n_samples, batch, channels), shape (n_samples, batch, n)."""
-        z = recursion(self.A, v, v[0] @ self.S.T, self.B)
+        z = recursion(self.A, self.B, v[0] @ self.S.T, v)
         return z @ self.C.T + v @ self.D.T
 
 

@@ -19,7 +19,7 @@ from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import mixed_plant
 from ..result import Status, Synthesis
 from ..riccati.h2 import balancing
-from ..worst_case.certificate import certified
+from ..worst_case.worst_case_h2 import certified
 from .barrier import Ending, minimise
 from .inequalities import MixedInequalities
 

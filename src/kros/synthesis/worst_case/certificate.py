@@ -23,10 +23,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...core import ITERATED, ROUNDING, AnyArray, StateSpace, SynthesisError, h2_norm
+from ...core import ITERATED, ROUNDING, AnyArray, StateSpace, SynthesisError
 from ...core.linalg import energy
 from ..problem.observer_problem import ObserverProblem
-from ..result import Status, Synthesis
 from .ball import spread, uncertain_ball
 
 _ACCURACY = 1e-5  # of the quadrature, relative
@@ -54,13 +53,11 @@ def _responses(
     return r, T, certain, energy(noise)
 
 
-def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, float]:
-    """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error that it includes."""
-    return certify_errors(problem, problem.error_system(controller))
-
-
 def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> tuple[float, float]:
-    """Return what `certify` returns, for the error system from (d, r, n[, s]) and the mean of ``W_p e``."""
+    """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error in it, for a system of errors.
+
+    It is the error system from (d, r, n[, s]), with the mean of ``W_p e``.
+    """
     problem.require_sound()
     if not errors.is_stable():
         radius = float(errors.spectral_radius())
@@ -73,22 +70,6 @@ def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray 
     squared += float(np.sum(np.square(mean)))
     upper = float(np.sqrt(squared + error))
     return upper, upper - float(np.sqrt(squared))
-
-
-def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> Synthesis:
-    """Return a controller in physical units with its certificate; ``h2_norm`` is that of the noise alone."""
-    loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
-    value, error = certify_errors(problem, loop)
-    return Synthesis(
-        method=method,
-        controller=controller,
-        status=Status.CERTIFIED,
-        injection=problem.injection,
-        h2_norm=h2_norm(StateSpace(loop.A, loop.B[:, white:], loop.C, loop.D[:, white:], loop.dt)),
-        worst_case_h2=value,
-        quadrature_error=error,
-        spectral_radius=loop.largest_pole(),
-    )
 
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)

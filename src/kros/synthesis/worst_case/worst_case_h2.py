@@ -23,12 +23,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core import StateSpace, block_diagonal
+from ...core import StateSpace, block_diagonal, h2_norm
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import shaped_plant
-from ..result import Injection, Synthesis, enclosed
+from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.h2 import predictor
-from .certificate import certified
+from .certificate import certify_errors
 from .disturbance import average_disturbance
 from .members import lower_bound
 
@@ -81,6 +81,22 @@ def worst_case_h2(
     lower, gap, notes = enclosed(best.worst_case_h2 or 0.0, lower_bound(problem))
     note = "The spectral radius is that of the nominal loop and says nothing about robustness, worst_case_h2 does."
     return replace(best, lower_bound=lower, gap_percent=gap, notes=(note, *notes))
+
+
+def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> Synthesis:
+    """Return a controller in physical units with its certificate; ``h2_norm`` is that of the noise alone."""
+    loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
+    value, error = certify_errors(problem, loop)
+    return Synthesis(
+        method=method,
+        controller=controller,
+        status=Status.CERTIFIED,
+        injection=problem.injection,
+        h2_norm=h2_norm(StateSpace(loop.A, loop.B[:, white:], loop.C, loop.D[:, white:], loop.dt)),
+        worst_case_h2=value,
+        quadrature_error=error,
+        spectral_radius=loop.largest_pole(),
+    )
 
 
 def design(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpace:

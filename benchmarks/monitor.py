@@ -28,6 +28,7 @@ from kros.design.monitor import MonitorSettings, fit_monitor
 from kros.design.training import TrainingSet
 from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
+from kros.observer.monitor import Watch
 from kros.observer.simulate import run_innovations
 from kros.plants.harmonic_drive.dynamics import DriveParameters
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
@@ -104,7 +105,7 @@ def levels(observer: Observer, recorded: TrainingSet) -> list[tuple[str, str, np
         step = np.abs(np.diff(y, axis=0, prepend=y[:1]))[..., 0]
         motion = np.cumsum(step > 0.1 * np.sqrt(np.mean(step**2)), axis=0) * dt
         for i, key in enumerate(batch.keys):
-            level = monitor.level(monitor.mean_squares(nu[:, i], judged[:, i]))
+            level = monitor.level(Watch(monitor).mean_squares(nu[:, i], judged[:, i]))
             rows.append((key.unit, key.condition, level, motion[:, i]))
     return rows
 

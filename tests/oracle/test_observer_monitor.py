@@ -35,7 +35,7 @@ def test_one_machine_is_watched_as_many_at_once(machine, bound):
     observer, (y, u) = watched(machine, bound), samples(800)
     found, status = levels(observer, y, u)
     innovation, judged = run_innovations(observer, y[:, None], u[:, None], settle=observer.monitor.settle)
-    wanted = observer.monitor.level(observer.monitor.mean_squares(innovation[:, 0], judged[:, 0]))
+    wanted = observer.monitor.level(Watch(observer.monitor).mean_squares(innovation[:, 0], judged[:, 0]))
     np.testing.assert_allclose(found, wanted, atol=1e-9)
     outside = (status & SampleStatus.UNCERTIFIED) > 0
     np.testing.assert_array_equal(outside, wanted > 0)
@@ -65,7 +65,7 @@ def test_bands_pass_the_power_that_their_filters_say():
     np.testing.assert_allclose(np.abs(response).max(axis=1), 1, rtol=1e-6)
     noise = rng.normal(size=(400_000, 1))
     monitor = Monitor(filters, 1e-5, 0, np.ones(1), np.ones((1, 6)), np.array([[16, 0, 0, 0, 0, 0]]), 0.02)
-    powers = monitor.mean_squares(noise, np.ones(400_000, dtype=bool))[-1, 0]
+    powers = Watch(monitor).mean_squares(noise, np.ones(400_000, dtype=bool))[-1, 0]
     np.testing.assert_allclose(powers, np.mean(np.abs(response) ** 2, axis=1) * (1 - (1 - 1e-5) ** 400_000), rtol=0.05)
 
 
@@ -74,8 +74,8 @@ def test_in_the_beginning_mean_squares_are_means():
     filters, rng = octaves(), np.random.default_rng(4)
     monitor = Monitor(filters, 0.01, 0, np.ones(1), np.ones((1, 6)), np.array([[16, 0, 0, 0, 0, 0]]), 0.02, first=0.1)
     noise, judged = rng.normal(size=(500, 1)), np.ones(500, dtype=bool)
-    squares = replace(monitor, forget=1.0, first=0.0).mean_squares(noise, judged)[:, 0]
-    found = monitor.mean_squares(noise, judged)[:, 0]
+    squares = Watch(replace(monitor, forget=1.0, first=0.0)).mean_squares(noise, judged)[:, 0]
+    found = Watch(monitor).mean_squares(noise, judged)[:, 0]
     np.testing.assert_allclose(found[:91], np.cumsum(squares, axis=0)[:91] / (10 + np.arange(91))[:, None], rtol=1e-12)
     np.testing.assert_allclose(found[91:], 0.99 * found[90:-1] + 0.01 * squares[91:], rtol=1e-9)
     halves = [(noise[:200], judged[:200]), (noise[200:], judged[200:])]

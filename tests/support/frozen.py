@@ -34,7 +34,8 @@ def compared(
     """Compare responses, errors and bounds, episode by episode."""
     seen, lengths, scales = course(observer, batch), batch.lengths, certificate.scales
     if estimates is not None:
-        seen = replace(seen, error=observer.runtime.clip_estimate(batch.states.copy()) - estimates)
+        states = np.clip(batch.states, *observer.runtime.sides(batch.states.shape[-1]))
+        seen = replace(seen, error=states - estimates)
     with np.errstate(divide="ignore", invalid="ignore"):
         w = np.concatenate([seen.omega / scales.residual, seen.noise / scales.noise], axis=-1)
     w[np.isnan(w)] = 0.0

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -170,7 +171,7 @@ class ObserverData:
         """Where the correction enters, shape (n_lifted, width)."""
         return self.B if self.injection is Injection.INPUT else np.eye(self.A.shape[0])
 
-    @property
+    @cached_property
     def filter_gain(self) -> Array:
         """Gain L_f of ``x_hat + L_f (y - C x_hat)``, (n, q): ``A_s L_f = (into D^c)_s`` by least squares."""
         n = self.lifting.n_states

@@ -71,12 +71,12 @@ def level(age: Array, half: Array | float = 1.0) -> Array:
     return ratio * ratio / (1 + ratio * ratio)
 
 
-def longest_age(half: Array) -> Array:
+def longest_age(half: Any) -> Any:
     """Return the largest ages that count when measurements return: m is then below 1 % after five time constants."""
     return 0.1 * np.exp(5) * half
 
 
-OLDEST = float(longest_age(np.ones(1))[0])  # age of a start
+OLDEST = float(longest_age(1.0))  # age of a start
 _WAITING = 2 * OLDEST  # stands for it until a sample has all measurements
 
 

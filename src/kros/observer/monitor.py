@@ -64,10 +64,6 @@ class Monitor:
                 f"1, settle at least 0; found {self}."
             )
 
-    def mean_squares(self, innovation: Array, judged: Flags) -> Array:
-        """Return mean squares of a machine, (n_samples, q, bands), after every sample; those not judged change none."""
-        return Watch(self).mean_squares(innovation, judged)
-
     def scaled(self, innovation: Array) -> Array:
         """Return innovations (..., q) over their sizes, within what counts at most."""
         scaled = innovation / self.size
@@ -76,7 +72,7 @@ class Monitor:
     def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
         """Return the mean squares of episodes, (n_samples, q, bands), that a machine has one after the other."""
         innovation, judged = (np.concatenate(parts) for parts in zip(*episodes, strict=True))
-        return np.split(self.mean_squares(innovation, judged), np.cumsum([len(own) for _, own in episodes])[:-1])
+        return np.split(Watch(self).mean_squares(innovation, judged), np.cumsum([len(own) for _, own in episodes])[:-1])
 
     def level(self, mean_squares: Array) -> Array:
         """Return the level over the bound in dB, (...), of mean squares (..., q, bands)."""

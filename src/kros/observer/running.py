@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -109,10 +108,6 @@ class RunningObserver:
         self._fresh = self.observer.bank is not None or bool(self._screen.enough(np.isfinite(first.y)).all())
         self._course.begin(first)
 
-    @cached_property
-    def _filter_gain(self) -> Array:
-        return self.observer.filter_gain
-
     @property
     def estimate(self) -> Estimate:
         """One-step prediction: the state at k from what arrived up to k - 1."""
@@ -125,7 +120,7 @@ class RunningObserver:
             return self.estimate
         given = self._sample(y).y[0]
         nu = np.where(np.isfinite(given), steps.innovation(given), 0.0)
-        return self._forward(steps.x + nu @ self._filter_gain.T)
+        return self._forward(steps.x + nu @ o.filter_gain.T)
 
     def step(self, y: ArrayLike | None, u: ArrayLike | None) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
@@ -182,5 +177,6 @@ class RunningObserver:
         ahead, steps = self._course.ahead(), self._course.steps
         if len(ahead):
             x = forward(self.observer, steps.values, np.array([len(ahead)]), x, steps.earlier(ahead[0]), ahead)
-        recorded = self.observer.runtime.clip_estimate(x[0, : len(self.states)].copy())
+        recorded = x[0, : len(self.states)].copy()
+        self.observer.runtime.clip_estimate(recorded)
         return Estimate(zip(self.states, recorded.tolist(), strict=True))

@@ -78,7 +78,7 @@ class Runtime:
         if int(self.delay) != self.delay or self.delay < 0:
             raise DataError(f"{what}: the delay of {self.delay} should be a whole number of samples, at least 0.")
         floats(self, what, **dict.fromkeys(self.by_state(), "numbers"))
-        if len(self.limits()) > 1 and np.any(np.greater(*self.limits().values())):
+        if self.lower is not None and self.upper is not None and np.any(self.lower > self.upper):
             raise DataError(f"{what}: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
 
     def by_state(self) -> dict[str, Array]:
@@ -89,26 +89,19 @@ class Runtime:
         """Return the first estimate of n states before any measurement."""
         return np.zeros(n) if self.start is None else self.start
 
-    def limits(self) -> dict[str, Array]:
-        """Return the limits that there are, by name."""
-        return {name: values for name, values in self.by_state().items() if name != "start"}
-
     def sides(self, n: int) -> tuple[Array, Array]:
         """Return lower and upper limits of the first n states, infinite where there are none."""
-        limits = self.limits()
-        return limits.get("lower", np.full(n, -np.inf))[:n], limits.get("upper", np.full(n, np.inf))[:n]
+        low, high = np.full((2, n), [[-np.inf], [np.inf]])
+        return low if self.lower is None else self.lower[:n], high if self.upper is None else self.upper[:n]
 
     def binds(self, x: Array) -> Flags:
         """Return which estimates, (..., n), meet a limit."""
         low, high = self.sides(x.shape[-1])
         return np.asarray(((x <= low) | (x >= high)).any(axis=-1))
 
-    def clip_estimate(self, x: Array) -> Array:
+    def clip_estimate(self, x: Array) -> None:
         """Bring estimates or recorded states, the first ones, (..., n), within their limits, in place."""
-        low, high = self.sides(x.shape[-1])
-        for i in np.flatnonzero(np.isfinite(low) | np.isfinite(high)):
-            np.clip(x[..., i], low[i], high[i], out=x[..., i])
-        return x
+        np.clip(x, *self.sides(x.shape[-1]), out=x)
 
 
 @frozen

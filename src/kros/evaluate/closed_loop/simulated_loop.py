@@ -26,7 +26,8 @@ def diverging(
     course.begin(screened(observer, x[None][..., q], u[None]))
     past, diverged = lifting.window.hold(x, u), np.zeros(len(rows), dtype=bool)
     for command in batch.inputs:
-        estimate = observer.runtime.clip_estimate(course.steps.x[:, :n].copy())
+        estimate = course.steps.x[:, :n].copy()
+        observer.runtime.clip_estimate(estimate)
         u = np.clip(command + xi @ K.C.T + estimate @ K.D.T, low, high)
         xi = xi @ K.A.T + estimate @ K.B.T
         course.take(x[None][..., q], u[None])

@@ -128,7 +128,8 @@ class Course:
 def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     """Return what drove an observer along episodes; recorded states stand for the true ones."""
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
-    states = observer.runtime.clip_estimate(batch.states.copy())
+    states = batch.states.copy()
+    observer.runtime.clip_estimate(states)
     values = {**observer.parameters, **observer.own(batch.parameters)}
     due = np.maximum(np.arange(len(states)) - late, 0)
     y = batch.states[due][..., at] if batch.shown is None else batch.measurements(at, arrived=False)

@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
+from batches import batch_of
 from scipy.linalg import solve_discrete_are
 
 import kros
 from kros.data import EpisodeBatch
 from kros.design.methods import methods_of
 from kros.design.synthesize import tasks_of
+from kros.lifting import Lifting
 from kros.observer import EstimatorSettings, run_observer
-from kros.observer.residual import one_step_covariance
+from kros.observer.residual import residual_covariance
 from kros.observer.units import in_sizes
 from kros.plants import DcMotorPopulation
 
@@ -67,6 +69,8 @@ def test_the_tuned_filter_is_at_least_as_good_as_the_textbooks(uncertain):
 
 
 def test_covariance_of_residuals_counts_every_sample_of_every_episode_once():
-    residual = np.random.default_rng(0).normal(size=(7, 3, 2)) + 1
-    rows = np.concatenate([residual[:5, 0], residual[:7, 1], residual[:2, 2]])
-    np.testing.assert_allclose(one_step_covariance(residual, [5, 7, 2]), sum(np.outer(r, r) for r in rows) / 14)
+    states = np.random.default_rng(0).normal(size=(8, 3, 2)) + 1
+    rows = np.concatenate([states[1:6, 0], states[1:8, 1], states[1:3, 2]])
+    batch = batch_of(states, states[..., :1], 0.1, lengths=[6, 8, 3])
+    found = residual_covariance(Lifting(("x", "v")), np.zeros((2, 2)), np.zeros((2, 1)), batch)
+    np.testing.assert_allclose(found, sum(np.outer(r, r) for r in rows) / 14)

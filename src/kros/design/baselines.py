@@ -13,10 +13,11 @@ from ..core import TINY, Array, Columns, ConfigError, DataError, Parameters, Rec
 from ..data import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
-from ..observer import Screen, Seen, like_measurement_noise, one_step_covariance, one_step_residual
+from ..observer import Screen, Seen, like_measurement_noise, residual_covariance
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
-from ..observer.baselines.learned import Moments, Ridge
+from ..observer.baselines.learned import DEFAULT as RIDGE
+from ..observer.baselines.learned import Moments
 from ..observer.baselines.trained import Regressor, Rows
 from .task import Label
 from .training import TrainingSet, rank
@@ -75,8 +76,7 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
     """Tune the extended Kalman filter of a nominal model: process noise of many sizes, all run side by side."""
     batch, lifting, n = training.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
-    residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, batch.parameters)
-    shape = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
+    shape = residual_covariance(lifting, models.A[row], models.B[row], batch)
     shape = shape * like_measurement_noise(shape[np.ix_(C, C)], R)
     filters = ExtendedKalman(
         lifting,
@@ -124,7 +124,7 @@ def make_difference(training: TrainingSet, measured: Columns) -> Baseline:
 def make_learned(training: TrainingSet, measured: Columns) -> Baseline:
     """Train the learned estimator on whole training episodes of all units, once for every unit without it."""
     samples = len(training.population.read(training.keys[0])) * len(training.keys)
-    step = max(1, samples // Ridge().rows)
+    step = max(1, samples // RIDGE.rows)
     moments = Moments.of(training.one_by_one(), measured, step)
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "the unit under test"}
     estimators = {unit: moments.estimator([unit]) for unit in moments.units} | {"": moments.estimator()}

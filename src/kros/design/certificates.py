@@ -170,14 +170,12 @@ def guards_of(observers: Sequence[Observer], batches: Sequence[EpisodeBatch]) ->
 
 def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> tuple[Array, Array, Array, list[Array]]:
     """Return bounds of estimates and recordings (observer, n), sizes of recordings (n,), and largest corrections."""
-    n, q = observers[0].lifting.n_states, list(observers[0].measured)
+    q = list(observers[0].measured)
     y, states, inputs = batch.measurements(q)[first:], batch.states[first:], batch.inputs[first:]
-    recorded = np.arange(n) < states.shape[-1]
     inside = (np.arange(first, first + len(y))[:, None] < batch.lengths)[..., None]
     x = np.stack([*run_observers(observers, y, inputs, observers[0].own(batch.parameters))])
-    least, most = np.full(n, np.inf), np.full(n, -np.inf)
-    least[recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
-    most[recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)
+    least = states.min(axis=(0, 1), where=inside, initial=np.inf)
+    most = states.max(axis=(0, 1), where=inside, initial=-np.inf)
     low = np.minimum(x.min(axis=(1, 2), where=inside, initial=np.inf), least)
     high = np.maximum(x.max(axis=(1, 2), where=inside, initial=-np.inf), most)
     corrections = []
@@ -201,8 +199,11 @@ def _guard(observer: Observer, low: Array, high: Array, correction: Array) -> Gu
 def certificate(task: DesignTask, design: Design) -> Record:
     """Return what holds for an observer on every member of the set."""
     observer = design.observer
-    order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
-    facts: Record = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
+    facts: Record = {
+        "order": observer.controller.n_states + observer.internal,
+        "spectral_radius_max": None,
+        "worst_case_h2": None,
+    }
     if design.facts.get("rows_fitted_to_single_steps"):
         reason = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
         return facts | {"reason": reason}

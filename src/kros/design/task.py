@@ -13,7 +13,7 @@ import numpy as np
 from ..core import Array, ByName, Names, Record, SynthesisError, frozen, gain, load_artifact, loader, save_artifact
 from ..data import Shown
 from ..identify import ModelSet
-from ..observer import Observer, ReliftCertificate, Sensors
+from ..observer import Observer, ReliftCertificate
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .training import TrainingSet, percent_of, rank
 
@@ -150,17 +150,12 @@ class DesignTask:
             parameters=models.parameters_of(self.unit),
             runtime=self.training.runtime,
             seen=self.training.seen,
-            sensor=self.sensor,
+            sensor=self.training.sensor,
         )
 
     def designed(self, synthesis: Synthesis, **facts: Any) -> Design:
         """Return the design of a synthesis that corrects the nominal model."""
         return Design(self.name, self.observer(synthesis), synthesis, facts)
-
-    @property
-    def sensor(self) -> Sensors:
-        """What is declared of the sensors of measured states, by name, in the task's channels."""
-        return self.training.sensor
 
     @property
     def selector(self) -> Array:

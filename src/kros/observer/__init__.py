@@ -17,7 +17,7 @@ from .estimator.build import identify_estimator
 from .estimator.rows import Recordings, spread
 from .estimator.settings import EstimatorSettings
 from .observer import Observer
-from .residual import like_measurement_noise, one_step_covariance, one_step_residual
+from .residual import like_measurement_noise, one_step_residual, residual_covariance
 from .running import Estimate, RunningObserver
 from .runtime import Runtime, Seen
 from .screen import SampleStatus, Screen, screened

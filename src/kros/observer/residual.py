@@ -79,9 +79,10 @@ def mean_error_dynamics(A: Array, slopes: Array) -> Array:
     return A[:n, :n] + A[:n, n:] @ slopes
 
 
-def one_step_covariance(residual: Array, lengths: ArrayLike) -> Array:
-    """Return the mean product of residuals (n_samples, batch, n) over all episodes, shape (n, n)."""
-    counted = residual[np.arange(len(residual))[:, None] < np.asarray(lengths)]
+def residual_covariance(lifting: Lifting, A: Array, B: Array, batch: EpisodeBatch) -> Array:
+    """Return the mean product of one-step residuals (n_samples, batch, n) over all episodes, shape (n, n)."""
+    residual = one_step_residual(lifting, A, B, batch.states, batch.inputs, batch.parameters)
+    counted = residual[np.arange(len(residual))[:, None] < batch.lengths - 1 - lifting.history]
     return counted.T @ counted / len(counted)
 
 

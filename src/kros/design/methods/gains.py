@@ -16,9 +16,8 @@ from ...observer.residual import (
     like_measurement_noise,
     mean_error_dynamics,
     mean_slopes,
-    one_step_covariance,
-    one_step_residual,
     one_step_rows,
+    residual_covariance,
     residual_models,
     with_rows,
 )
@@ -50,11 +49,10 @@ class KalmanTuned(Method):
     def design(self, task: DesignTask) -> Design:
         """Return the candidate of least error of the hidden states; process noise is like the one-step residuals."""
         models, batch, n = task.models, task.training.read(), task.models.lifting.n_states
-        lifting, nominal, recorded = models.lifting, models.index(task.unit), (batch.states, batch.inputs)
+        lifting, nominal = models.lifting, models.index(task.unit)
         A, B = with_rows(models.A[nominal], models.B[nominal], *one_step_rows(lifting, batch))
-        residual = one_step_residual(lifting, A, B, *recorded, batch.parameters)
-        covariance = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
-        dynamics = mean_error_dynamics(A, mean_slopes(lifting, *recorded, batch.parameters))
+        covariance = residual_covariance(lifting, A, B, batch)
+        dynamics = mean_error_dynamics(A, mean_slopes(lifting, batch.states, batch.inputs, batch.parameters))
         noise, C = np.diag(task.noise**2), task.selector[:, :n]
         candidates = _candidates(dynamics, C, covariance, noise, models.sample_period_s)
         tried = [(level, _padded(gains, lifting.n_lifted)) for level, gains in candidates]
@@ -90,7 +88,7 @@ class ResidualH2(Method):
 
     name = "residual_h2"
     label = Label("residual-shaped H2", "noise shaped like the recorded residuals", "INK")
-    max_order: int = 12  # of the observer beside the model
+    correction_order: int = 12  # at most
     compared: int = 3  # most promising models that are tried on training episodes
 
     def design(self, task: DesignTask) -> Design:
@@ -105,8 +103,8 @@ class ResidualH2(Method):
                 "Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings."
             )
         problems = [ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
-        lifted, order = given.lifting.n_lifted, self.max_order
-        syntheses = [residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]
+        lifted, order = given.lifting.n_lifted, self.correction_order
+        syntheses = [residual_h2(problem, n_lifted=lifted, order=order) for problem in problems]
         observers = [task.observer(one, model.A, model.B) for model, one in zip(models, syntheses, strict=True)]
         best, error = task.best(observers)
         if not np.isfinite(error):

@@ -29,6 +29,9 @@ class Ridge:
     rows: int = 100_000  # of all episodes together, evenly spread; neighbouring samples hardly differ
 
 
+DEFAULT = Ridge()
+
+
 @frozen
 class Learned:
     """The trained estimator."""
@@ -63,10 +66,10 @@ class Moments:
 
     @classmethod
     def of(
-        cls, batches: Iterable[EpisodeBatch], measured: Sequence[int], step: int = 1, settings: Ridge | None = None
+        cls, batches: Iterable[EpisodeBatch], measured: Sequence[int], step: int = 1, settings: Ridge = DEFAULT
     ) -> Moments:
         """Collect every so many rows of training episodes."""
-        settings, total = settings or Ridge(), dict[str, Array]()
+        total = dict[str, Array]()
         estimated: Columns = ()
         for batch in batches:
             estimated = tuple(i for i in range(batch.states.shape[-1]) if i not in measured)

@@ -178,8 +178,6 @@ class ResidualProblem:
 
     def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, most: int) -> StateSpace:
         """Correction filter of the lowest order within the tolerance, by bisection over balanced truncations."""
-        if not shaping.n_states or (tolerance_percent <= 0 and most >= shaping.n_states):
-            return K
         best, loop = self.deviations(shaping, K), self.loop(shaping, K)
         seen = gramian_root(loop.A.T, (loop.C / best[:, None]).T)[-shaping.n_states :]
         left, right, values = balancing(gramian_root(shaping.A, shaping.B), seen, ROUNDING)
@@ -204,11 +202,11 @@ def residual_h2(
     problem: ResidualProblem,
     tolerance_percent: float = 1.0,
     n_lifted: int | None = None,
-    max_order: int | None = None,
+    order: int | None = None,
 ) -> Synthesis:
     """Return the correction that is optimal for residuals; reducing its order costs each hidden state the tolerance."""
     full = problem.filter()
-    most = full.n_states if max_order is None else max_order
+    most = full.n_states if order is None else order
     K = problem.reduced(full, problem.correction(full), tolerance_percent, most)
     norm = float(np.linalg.norm(problem.deviations(full, K)))
     note = f"mean of {len(problem.spectra)} units, {problem.basis.delays} delays, lags {problem.basis.poles}"

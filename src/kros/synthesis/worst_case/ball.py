@@ -15,7 +15,7 @@ Giving them multipliers g_i, l_j >= 0 with ``g_i + l_j >= d_ij`` and completing 
     ||a + P Theta Q||_F^2 <= ||a||_F^2 + sum_i g_i + sum_j l_j + sum_ij |c_ij|^2 / (g_i + l_j - d_ij).
 
 *Any* feasible multipliers give a valid bound; coordinate descent makes it good. For ``a = 0`` it is ``sum s_i^2 q_i^2``
-(von Neumann's trace inequality, `spread`), for scalars ``(|a| + s q)^2``: both exact.
+(von Neumann's trace inequality), for scalars ``(|a| + s q)^2``: both exact.
 
 *Average.* Theta uniform on the matrices (b, a) with orthonormal columns or rows has mean zero and ``E[Theta Q Q^H
 Theta^H] = I ||Q||_F^2 / max(a, b)`` (`Ball.average`).
@@ -63,13 +63,6 @@ class Ball:
 def uncertain_ball(problem: ObserverProblem, freqs_hz: AnyArray) -> Ball:
     """Return the ball of ``Delta (I - N Delta)^-1 M`` of a problem at frequencies."""
     return Ball.of(problem.N.frequency_response(freqs_hz), problem.M.frequency_response(freqs_hz))
-
-
-def spread(P: AnyArray, Q: AnyArray) -> AnyArray:
-    """Largest ``||P Theta Q||_F`` over contractions, ``(sum_i s_i(P)^2 s_i(Q)^2)^(1/2)``, shape (f,)."""
-    s, t = svd(P, compute_uv=False), svd(Q, compute_uv=False)
-    k = min(s.shape[-1], t.shape[-1])
-    return np.sqrt(np.sum((s[..., :k] * t[..., :k]) ** 2, axis=-1))
 
 
 def _with_gains(U: AnyArray, gains: AnyArray) -> AnyArray:

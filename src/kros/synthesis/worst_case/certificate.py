@@ -26,7 +26,7 @@ import numpy as np
 from ...core import ITERATED, ROUNDING, AnyArray, StateSpace, SynthesisError
 from ...core.linalg import energy
 from ..problem.observer_problem import ObserverProblem
-from .ball import spread, uncertain_ball
+from .ball import dual_bound, uncertain_ball
 
 _ACCURACY = 1e-5  # of the quadrature, relative
 
@@ -37,7 +37,7 @@ def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) ->
     uncertain = uncertain_ball(problem, freqs_hz).bound(T, certain)
     if problem.remainder is not None:
         left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
-        uncertain = uncertain + spread(response @ left, right)
+        uncertain = uncertain + dual_bound(np.zeros((response.shape[1], right.shape[2])), response @ left, right)
     return uncertain**2 + noise
 
 

@@ -25,7 +25,7 @@ from kros.design.baselines import make_learned
 from kros.design.training import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import EstimatorSettings, Recordings, identify_estimator, run_observer
-from kros.observer.baselines.trained import Rows
+from kros.observer.baselines.learned import Rows
 from kros.study import Stage, load_config
 
 METHODS = ("estimator", "ridge", "boosting", "network")

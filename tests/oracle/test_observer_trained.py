@@ -7,7 +7,7 @@ import kros
 from kros.data import EpisodeBatch
 from kros.design.baselines import make_trained
 from kros.design.training import TrainingSet
-from kros.observer.baselines.trained import Features
+from kros.observer.baselines.learned import Features
 
 
 def test_features_are_of_past_samples_alone():

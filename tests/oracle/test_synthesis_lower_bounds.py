@@ -12,7 +12,7 @@ from kros.synthesis import Injection, ObserverProblem, Status, Synthesis, worst_
 from kros.synthesis.result import enclosed
 from kros.synthesis.riccati.h2 import predictor_bound
 from kros.synthesis.worst_case.certificate import certify_errors
-from kros.synthesis.worst_case.members import mean, member, shifts
+from kros.synthesis.worst_case.worst_case_h2 import mean, member, shifts
 
 DT = 1.0
 FULL = StateSpace([[0.6]], [[1.0, 0.3]], [[0.1], [0.05]], [[0.2, 0.1], [0.0, 0.2]], DT)

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from kros.synthesis.worst_case.disturbance import filters
+from kros.synthesis.worst_case.worst_case_h2 import filters
 from kros.uncertainty import fit_magnitude
 
 DT = 1e-3

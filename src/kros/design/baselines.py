@@ -17,8 +17,7 @@ from ..observer import Screen, Seen, like_measurement_noise, residual_covariance
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from ..observer.baselines.learned import DEFAULT as RIDGE
-from ..observer.baselines.learned import Moments
-from ..observer.baselines.trained import Regressor, Rows
+from ..observer.baselines.learned import Moments, Regressor, Rows
 from .task import Label
 from .training import TrainingSet, rank
 

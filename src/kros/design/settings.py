@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from pydantic import Field
 
 from ..core import Settings
-from ..observer.baselines.trained import Regressor
+from ..observer.baselines.learned import Regressor
 from .baselines import BASELINES
 from .methods import METHODS
 

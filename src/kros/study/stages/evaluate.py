@@ -19,7 +19,7 @@ from ...evaluate.held_out import HeldOut, Outcome, alike
 from ...evaluate.over_units import interval_rows
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
-from ...observer.baselines.trained import Regressor
+from ...observer.baselines.learned import Regressor
 from ...report.run_folder import Shown
 from ..engine.context import Context
 from .load import run_load

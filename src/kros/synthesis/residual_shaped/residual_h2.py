@@ -31,6 +31,7 @@ spectral estimator", IEEE Transactions on Signal Processing 48 (2000) 3189-3205.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import field, replace
 from functools import cached_property
 
@@ -187,15 +188,11 @@ class ResidualProblem:
             L, R = left[:k], right[:, :k]
             return self.correction(replace(shaping, A=L @ shaping.A @ R, B=L @ shaping.B, C=shaping.C @ R))
 
-        low, high = -1, min(len(values), most) + 1
-        while high - low > 1:
-            k = (low + high) // 2
-            trial = of_order(k)
-            if np.all(self.deviations(shaping, trial)[self.hidden] <= allowed):
-                K, high = trial, k
-            else:
-                low = k
-        return K if K.n_states <= most else of_order(min(len(values), most))
+        def enough(k: int) -> bool:
+            return bool(np.all(self.deviations(shaping, of_order(k))[self.hidden] <= allowed))
+
+        most = min(len(values), most)
+        return of_order(min(bisect_left(range(most + 1), True, key=enough), most))
 
 
 def residual_h2(

@@ -22,11 +22,13 @@ gamma : level;  K : controller
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from ...core import AGREED, EPS, ITERATED, AnyArray, ConfigError, KrosError, StateSpace, SynthesisError, frozen, gain
 from ...core.linalg import adjoint
-from ...core.norms import first_frequencies, h2_norm, hinf_norm
+from ...core.norms import first_frequencies, h2_norm, hinf_norm, sharpened
 from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Status, Synthesis, enclosed
@@ -140,7 +142,7 @@ _RANK = float(np.sqrt(EPS))  # relative: signals that are smaller prove nothing
 
 
 def frequency_bound(p: GeneralizedPlant) -> float:
-    """Return the largest bound of the frequencies around all poles, refined around the largest some rounds."""
+    """Return the largest bound of the frequencies around all poles, searched for around the largest."""
     from scipy.linalg import null_space
 
     sides = (p.A, p.B1, p.C1, p.D11, p.C2, p.D21), (p.A.T, p.C1.T, p.B1.T, p.D11.T, p.B2.T, p.D12.T)
@@ -149,16 +151,13 @@ def frequency_bound(p: GeneralizedPlant) -> float:
         A, _, _, D, _, D_y = side
         free = null_space(D_y)
         best = max(best, float(np.linalg.norm(D @ free, 2)) if D.size and free.size else 0.0)
-        points = _grid(A, p.dt) if len(A) and D.size else np.zeros(0)
-        for _ in range(5 if points.size else 0):  # rounds; the bound is proven after any of them
-            bounds = _bounds(side, points, p.dt)
-            k = int(np.argmax(bounds))
-            best = max(best, float(bounds[k]))
-            points = np.linspace(points[max(k - 1, 0)], points[min(k + 1, len(points) - 1)], 9)
+        if len(A) and D.size:
+            bounds, points = partial(_bounds, side, p.dt), _grid(A, p.dt)
+            best = max(best, sharpened(bounds, points, bounds(points))[1])
     return best
 
 
-def _bounds(side: tuple[AnyArray, ...], rad: AnyArray, dt: float) -> AnyArray:
+def _bounds(side: tuple[AnyArray, ...], dt: float, rad: AnyArray) -> AnyArray:
     """Return the bounds at frequencies, rad/s, in discrete time rad per sample."""
     A, B, C, D, C_y, D_y = side
     n, m, q = len(A), B.shape[1], len(C_y)

@@ -36,7 +36,7 @@ def bands(
     """Quantiles over the draws of sigma_max of the scaled deviation, and of every entry's magnitude: (unit,
     frequency[, n, m])."""
     off = (
-        np.stack([models.responses(row, freqs, dt) for row in range(len(models.estimate.A))])
+        np.stack([models.samples[row].responses(freqs, dt) for row in range(len(models.estimate.A))])
         - models.estimate.responses(freqs, dt)[:, None]
     )
     spectral = np.linalg.norm(off * input_scale / np.asarray(output_scale)[:, None], ord=2, axis=(-2, -1))

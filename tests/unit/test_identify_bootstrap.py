@@ -44,7 +44,7 @@ def test_responses_of_samples_are_those_of_their_models() -> None:
     drawn = samples()
     freqs, dt = np.array([0.0, 3.0, 50.0]), 0.01
     for unit in range(2):
-        found = drawn.responses(unit, freqs, dt)
+        found = drawn.samples[unit].responses(freqs, dt)
         for k, z in enumerate(np.exp(2j * np.pi * freqs * dt)):
             for draw, (A, B) in enumerate(zip(drawn.samples.A[unit], drawn.samples.B[unit], strict=True)):
                 np.testing.assert_allclose(found[draw, k], np.linalg.inv(z * np.eye(2) - A) @ B, rtol=1e-7)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -141,24 +140,13 @@ def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> B
     return Baseline(by_unit, measured, tuple(of_all.regressors), facts, training.seen)
 
 
-@frozen
-class Motions:
-    """Motions that are known by their inputs, (n_samples, m) each."""
-
-    inputs: tuple[Array, ...]
-
-    @cached_property
-    def largest(self) -> Array:
-        """Largest absolute value of every input."""
-        return np.max([np.abs(motion).max(axis=0) for motion in self.inputs], axis=0)
-
-    def nearest(self, u: Array) -> tuple[int, float]:
-        """Return the motion of least RMS difference from inputs, a share of the largest of all, and that difference."""
-        sizes = np.maximum(self.largest, np.abs(u).max(axis=0))
-        both = ((u[: len(motion)], motion[: len(u)]) for motion in self.inputs)
-        squares = (np.mean((one - other) ** 2, axis=0) for one, other in both)
-        apart = [float((np.sqrt(square) / np.maximum(sizes, TINY)).max()) for square in squares]
-        return apart.index(min(apart)), min(apart)
+def nearest(motions: Sequence[Array], u: Array) -> tuple[int, float]:
+    """Return the motion whose inputs have the least RMS difference from some, and that over the largest."""
+    sizes = np.max([np.abs(motion).max(axis=0) for motion in (*motions, u)], axis=0)
+    both = ((u[: len(motion)], motion[: len(u)]) for motion in motions)
+    squares = (np.mean((one - other) ** 2, axis=0) for one, other in both)
+    apart = [float((np.sqrt(square) / np.maximum(sizes, TINY)).max()) for square in squares]
+    return apart.index(min(apart)), min(apart)
 
 
 @frozen
@@ -167,7 +155,7 @@ class MeanProfile:
 
     n_states: int
     estimated: Columns
-    motions: Motions
+    motions: Sequence[Array]  # the inputs of each, (n_samples, m)
     states: Sequence[Array]  # (n_samples, h)
 
     def run(self, y: Array, u: Array, parameters: Parameters | None = None) -> Array:
@@ -175,7 +163,7 @@ class MeanProfile:
         del parameters
         estimate = np.full((*y.shape[:2], self.n_states), np.nan)
         for i in range(y.shape[1]):
-            states = self.states[self.motions.nearest(u[:, i])[0]]
+            states = self.states[nearest(self.motions, u[:, i])[0]]
             estimate[:, i, list(self.estimated)] = held(states, len(y))
         return estimate
 
@@ -194,7 +182,7 @@ def make_mean_profile(
     if not population.inputs or not estimated:
         raise DataError("Mean profile: it needs inputs that identify a motion, and a state that is not measured.")
     known = different_motions(population, keys)
-    motions = Motions(tuple(known.values()))
+    motions = list(known.values())
     means = unit_means(training, motions, estimated)
     for key, of_units in zip(known, means, strict=True):
         if len(of_units) < 2:
@@ -217,17 +205,17 @@ def different_motions(population: Population, keys: Iterable[EpisodeKey]) -> dic
     motions = dict[EpisodeKey, Array]()
     for key in keys:
         u = population.read_parts(key)[1]
-        if not motions or Motions(tuple(motions.values())).nearest(u)[1] > DEFAULT.same_motion:
+        if not motions or nearest(list(motions.values()), u)[1] > DEFAULT.same_motion:
             motions[key] = u
     return motions
 
 
-def unit_means(training: TrainingSet, motions: Motions, estimated: Columns) -> list[dict[str, Array]]:
+def unit_means(training: TrainingSet, motions: Sequence[Array], estimated: Columns) -> list[dict[str, Array]]:
     """Return the mean states of every motion by unit."""
-    profiles: list[dict[str, list[Array]]] = [{} for _ in motions.inputs]
+    profiles: list[dict[str, list[Array]]] = [{} for _ in motions]
     for part in training.one_by_one():
-        at, apart = motions.nearest(part.inputs[:, 0])
+        at, apart = nearest(motions, part.inputs[:, 0])
         if apart <= DEFAULT.same_motion:
-            states = held(part.states[:, 0, list(estimated)], len(motions.inputs[at]))
+            states = held(part.states[:, 0, list(estimated)], len(motions[at]))
             profiles[at].setdefault(part.units[0], []).append(states)
     return [{unit: np.mean(some, axis=0) for unit, some in one.items()} for one in profiles]

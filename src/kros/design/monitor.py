@@ -17,9 +17,9 @@ from itertools import combinations, product
 import numpy as np
 
 from ..core import EPS, ITERATED, ROUNDING, Array, Flags, Work, frozen, grouped
-from ..core.linalg import spectral_radius
 from ..observer import Observer, run_innovations, spread
 from ..observer.monitor import WEIGHT, Monitor, octaves
+from ..observer.sensor_gains import noise_response
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
 from .training import TrainingSet
 
@@ -152,10 +152,8 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
 
 def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
     """Return the samples in which a start is forgotten, by the slowest mode of a linear part or of a bank's filters."""
-    n, r, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted
-    radius = float(spectral_radius(observer.one_step[:, [*range(n), *range(nl, nl + r)]]))
+    radius = float(noise_response(observer).spectral_radius())
     if observer.bank is not None:
-        z = slice(len(observer.recorded), len(observer.recorded) + observer.bank.filters)
-        radius = float(max(spectral_radius(observer.A[z, z]), *observer.bank.start_recovery))
+        radius = max(radius, *observer.bank.start_recovery)
     samples = settings.settle[1] if radius >= 1 else np.log(settings.forgotten) / np.log(max(radius, ITERATED))
     return int(np.clip(np.ceil(samples), *settings.settle)) + observer.runtime.delay

@@ -134,14 +134,15 @@ class DesignTask:
     recordings: TrainingSet
     covered: Names
 
-    def observer(self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None) -> Observer:
+    def observer(self, synthesis: Synthesis, model: tuple[Array, Array] | None = None) -> Observer:
         """Return the observer of a synthesis, with the nominal model or another one."""
         models, row = self.models, self.models.index(self.unit)
+        A, B = model or (models.A[row], models.B[row])
         return Observer(
             name=self.name,
             lifting=models.lifting,
-            A=models.A[row] if A is None else A,
-            B=models.B[row] if B is None else B,
+            A=A,
+            B=B,
             measured=models.measured,
             inputs=models.recorded_inputs,
             controller=synthesis.controller,

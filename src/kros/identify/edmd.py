@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -59,6 +60,10 @@ class KoopmanMatrices:
 
     A: Array
     B: Array
+
+    def __getitem__(self, rows: Any) -> KoopmanMatrices:
+        """Return some models of a batch."""
+        return KoopmanMatrices(self.A[rows], self.B[rows])
 
     def spectral_radius(self) -> Array:
         """Return the largest eigenvalue magnitude of each A."""
@@ -112,7 +117,8 @@ def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
     stacked = [np.broadcast_to(part, (*batch, p, R.shape[-1])) for part in parts]
     triangle = qr_triangle(np.concatenate(stacked, axis=-2))
     R11, R12 = triangle[..., :p, :p], triangle[..., :p, p:]
-    pivots = relative_pivots(R11)
+    size = np.maximum(np.linalg.norm(R11, axis=-2), TINY)
+    pivots = np.abs(np.diagonal(R11, axis1=-2, axis2=-1)) / size  # what is left of a column beside those before it
     if np.any(pivots < p * EPS):
         *unit, column = (int(i) for i in np.argwhere(pivots < p * EPS)[0])
         where = f" of unit number {unit[0]}" if unit else ""
@@ -122,12 +128,6 @@ def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
         )
     U = np.swapaxes(np.linalg.solve(R11, R12), -1, -2)
     return KoopmanMatrices(U[..., :n_lifted], U[..., n_lifted:])
-
-
-def relative_pivots(R: Array) -> Array:
-    """Return what is left of every column of a triangle beside those before it, relative to the column."""
-    size = np.maximum(np.linalg.norm(R, axis=-2), TINY)
-    return np.abs(np.diagonal(R, axis1=-2, axis2=-1)) / size
 
 
 def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float = 0.0) -> float:
@@ -188,10 +188,6 @@ class ModelSamples:
 
     estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
     samples: KoopmanMatrices  # A (unit, draw, n, n) and B (unit, draw, n, m)
-
-    def responses(self, row: int, freqs_hz: Array, sample_period_s: float) -> AnyArray:
-        """Return frequency responses of one unit's samples, shape (draw, frequency, n, m)."""
-        return KoopmanMatrices(self.samples.A[row], self.samples.B[row]).responses(freqs_hz, sample_period_s)
 
 
 def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:

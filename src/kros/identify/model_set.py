@@ -57,6 +57,11 @@ class ModelSet(Shown, Storable):
         return rows | {"period": f"{self.sample_period_s:g} s"}
 
     @property
+    def matrices(self) -> KoopmanMatrices:
+        """The models' matrices."""
+        return KoopmanMatrices(self.A, self.B)
+
+    @property
     def about(self) -> str:
         """Order and largest spectral radius in a few words."""
         return f"order {self.lifting.n_lifted}, spectral radius at most {self.spectral_radius().max():.6g}"
@@ -89,7 +94,7 @@ class ModelSet(Shown, Storable):
 
     def normalised(self) -> ModelSet:
         """Return the models in channels divided by their ranges, with the lifting of such channels."""
-        matrices = self.ranges.normalise(KoopmanMatrices(self.A, self.B))
+        matrices = self.ranges.normalise(self.matrices)
         return replace(
             self,
             lifting=self.lifting.in_sizes(self.sizes),
@@ -116,7 +121,7 @@ class ModelSet(Shown, Storable):
     def systems(self, units: Sequence[str] | None = None) -> StateSpace:
         """Return the models as a batch from input to lifted state, all of it or some units."""
         rows = [self.index(u) for u in units] if units is not None else slice(None)
-        return KoopmanMatrices(self.A[rows], self.B[rows]).systems(self.sample_period_s)
+        return self.matrices[rows].systems(self.sample_period_s)
 
     def frequencies(self, n_freqs: int = 1000, decades: float = 6.0) -> Array:
         """Return logarithmic frequencies, Hz, from what the longest episode resolves up to Nyquist."""
@@ -136,7 +141,7 @@ class ModelSet(Shown, Storable):
 
     def spectral_radius(self) -> Array:
         """Return the spectral radius of every unit's model."""
-        return self.ranges.normalise(KoopmanMatrices(self.A, self.B)).spectral_radius()
+        return self.ranges.normalise(self.matrices).spectral_radius()
 
 
 def kinds_for(lifting: Lifting, *, refined: bool) -> dict[str, Lifting]:

@@ -36,7 +36,7 @@ def _even(rows: list[list[float]]) -> Array:
     """Return a matrix; rows of different lengths are refused."""
     if len(lengths := {len(row) for row in rows}) > 1:
         raise ValueError(f"all rows should have the same length, found {sorted(lengths)}")
-    return np.array(rows)
+    return np.array(rows, dtype=float) if rows else np.zeros((0, 0))
 
 
 Row = Annotated[list[Number], AfterValidator(np.array)]
@@ -165,13 +165,11 @@ def _observer(file: Any) -> ObserverData:
     lifting = Lifting(
         file.states, file.lifting, tuple(file.parameters), file.lifting_inputs, file.input_functions, file.sizes
     )
-    measured, order, K = file.measured, len(file.controller.A), file.controller
+    measured, K = file.measured, file.controller
     if len(set(measured)) < len(measured) or not set(measured) <= set(range(lifting.n_states)):
         raise DataError(
             f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {measured}."
         )
-    columns = ((K.A, order), (K.B, len(measured)), (K.C, order), (K.D, len(measured)))
-    A, B, C, D = (np.reshape(matrix, (len(matrix), width)) for matrix, width in columns)
     parts = {key: _given(vars(part)) for key in _PARTS if (part := getattr(file, key)) is not None}
     for name, end in (("lower", -np.inf), ("upper", np.inf)):
         if name in (runtime := parts.get("runtime", {})):
@@ -183,7 +181,7 @@ def _observer(file: Any) -> ObserverData:
         file.model.B,
         measured,
         file.inputs,
-        StateSpace(A, B, C, D, file.sample_period_s),
+        StateSpace(K.A, K.B if K.B.size else np.zeros((len(K.B), len(measured))), K.C, K.D, file.sample_period_s),
         file.injection,
         file.sample_period_s,
         _given(file.parameters),

@@ -174,7 +174,13 @@ class Options(WeightSettings):
 
     def scales(self, shape: tuple[int, ...]) -> tuple[AnyArray, AnyArray]:
         """Return the ranges of outputs and inputs."""
-        return check_scale("output", self.output_scale, shape[0]), check_scale("input", self.input_scale, shape[1])
+        given = {"output": self.output_scale, "input": self.input_scale}
+        scales = [np.ones(n) if v is None else np.asarray(v, float) for n, v in zip(shape, given.values(), strict=True)]
+        for side, size, scale in zip(given, shape, scales, strict=True):
+            if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
+                problem = f"{side}_scale needs {size} positive numbers, found {scale[:9]}"
+                raise DimensionError(f"Uncertainty: {problem}.")
+        return scales[0], scales[1]
 
     def ids(self, count: int) -> tuple[str, ...]:
         """Return the names of units, ``0, 1, ...`` by default, or raise an error where they do not fit."""
@@ -233,14 +239,6 @@ def stack_systems(models: Any) -> StateSpace:
 
     A, B, C, D = map(np.stack, zip(*map(padded, systems), strict=True))
     return StateSpace(A, B, C, D, systems[0].dt)
-
-
-def check_scale(side: str, values: ArrayLike | None, size: int) -> AnyArray:
-    """Return ranges as an array, ones by default, or say what is wrong with them."""
-    scale = np.ones(size) if values is None else np.asarray(values, float)
-    if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
-        raise DimensionError(f"Uncertainty: {side}_scale needs {size} positive numbers, found {scale[:9]}.")
-    return scale
 
 
 def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[AnyArray, AnyArray]:

@@ -60,7 +60,7 @@ def noise_share(
     noise, blocks = np.zeros(len(freqs_hz)), pieces(len(freqs_hz), OUTLIER.at_once // (draws * n * max(n, m)))
     for row in range(units):
         for part in blocks:
-            drawn = models.responses(row, freqs_hz[part], sample_period_s) / scale  # (draw, frequency, n, m)
+            drawn = models.samples[row].responses(freqs_hz[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += energy(residual(form, drawn, np.roll(drawn, 1, axis=0))).mean(axis=0) / units
     between = np.mean([energy(residual(form, G[k], G)) for k in evenly(units, OUTLIER.nominals)], axis=(0, 1))
     largest = sigma_max(residual(form, G[nominal], G)).max(axis=0)

@@ -55,8 +55,12 @@ class KalmanTuned(Method):
         dynamics = mean_error_dynamics(A, mean_slopes(lifting, batch.states, batch.inputs, batch.parameters))
         noise, C = np.diag(task.noise**2), task.selector[:, :n]
         candidates = _candidates(dynamics, C, covariance, noise, models.sample_period_s)
-        tried = [(level, _padded(gains, lifting.n_lifted)) for level, gains in candidates]
-        observers = [task.observer(gains, A, B) for _, gains in tried]
+        more = (0, lifting.n_lifted - n), (0, 0)  # rows of zeros for the lifted functions
+        tried = [
+            (level, replace(gains, controller=gain(np.pad(gains.controller.D, more), models.sample_period_s)))
+            for level, gains in candidates
+        ]
+        observers = [task.observer(gains, (A, B)) for _, gains in tried]
         errors = hidden_mean(percent_of(observers, batch), models.measured) if tried else np.array([np.inf])
         first = int(np.argmin(errors))
         if not np.isfinite(errors[first]):
@@ -74,12 +78,6 @@ def _candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterat
     for level in sorted((1 / base, *np.logspace(-6, 10, 9).tolist())):
         with suppress(SynthesisError):
             yield level, kalman(A, C, level * base * shape, R, dt)
-
-
-def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:
-    """Add rows of zeros for the lifted functions."""
-    K = synthesis.controller
-    return replace(synthesis, controller=gain(np.pad(K.D, ((0, n_lifted - len(K.D)), (0, 0))), K.dt))
 
 
 @frozen
@@ -105,7 +103,7 @@ class ResidualH2(Method):
         problems = [ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
         lifted, order = given.lifting.n_lifted, self.correction_order
         syntheses = [residual_h2(problem, n_lifted=lifted, order=order) for problem in problems]
-        observers = [task.observer(one, model.A, model.B) for model, one in zip(models, syntheses, strict=True)]
+        observers = [task.observer(one, (model.A, model.B)) for model, one in zip(models, syntheses, strict=True)]
         best, error = task.best(observers)
         if not np.isfinite(error):
             raise SynthesisError("Residual-shaped observer: the nonlinear observer diverges on the training episodes.")

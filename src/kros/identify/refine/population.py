@@ -244,7 +244,7 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
     """Refuse models whose free runs over a training episode leave the bound, in ranges of the states."""
     rows = [row for row, episodes in enumerate(data.keys.values()) for _ in episodes]
     keys = [key for episodes in data.keys.values() for key in episodes]
-    _, reached = free_run_errors(data, KoopmanMatrices(models.A[rows], models.B[rows]), rows, keys)
+    _, reached = free_run_errors(data, models[rows], rows, keys)
     for which, state in np.argwhere(~(reached <= bound)):
         size = f"{reached[which, state]:.3g} times the range of {data.lifting.states[state]!r}, beyond {bound:g}"
         remedy = "use functions that stay bounded, drop the episode, or set identify.refine = false"

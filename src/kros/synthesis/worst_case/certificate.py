@@ -33,24 +33,16 @@ _ACCURACY = 1e-7  # of the quadrature, relative
 
 def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) -> AnyArray:
     """Certified worst-case power density of ``W_p e``, shape (f,), for the error system from (d, r, n[, s])."""
-    response, T, certain, noise = _responses(problem, errors, freqs_hz)
-    uncertain = uncertain_ball(problem, freqs_hz).bound(T, certain)
-    if problem.remainder is not None:
-        left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
-        uncertain = uncertain + dual_bound(np.zeros((response.shape[1], right.shape[2])), response @ left, right)
-    return uncertain**2 + noise
-
-
-def _responses(
-    problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray
-) -> tuple[AnyArray, AnyArray, AnyArray | float, AnyArray]:
-    """Return the response of an error system to r, T, ``T_s W_u``, and the density of noise."""
     m, n = problem.nominal.n_inputs, problem.nominal.n_states
     response = errors.frequency_response(freqs_hz)
     d, r, noise, s = np.split(response, [m, m + n, m + n + len(problem.C)], axis=-1)
     T = (d if problem.form.at_input else r) @ problem.W_L.frequency_response(freqs_hz)
-    certain = s @ problem.input_weight.frequency_response(freqs_hz) if s.size else 0.0
-    return r, T, certain, energy(noise)
+    certain = s @ problem.input_weight.frequency_response(freqs_hz) if s.size else 0.0  # T_s W_u
+    uncertain = uncertain_ball(problem, freqs_hz).bound(T, certain)
+    if problem.remainder is not None:
+        left, right = (side.frequency_response(freqs_hz) for side in problem.remainder)
+        uncertain = uncertain + dual_bound(np.zeros((r.shape[1], right.shape[2])), r @ left, right)
+    return uncertain**2 + energy(noise)
 
 
 def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> tuple[float, float]:

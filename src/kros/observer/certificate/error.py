@@ -160,9 +160,9 @@ class _Assembly:
         self.following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, self.h - n))]) + self.columns @ middle
         for row, (name, lag) in enumerate(lags[n:], n):
             self.following[row, lags.index((name, lag - 1))] = 1.0
-        self.slots, self.counted = _driven(observer, scales, self.h), np.flatnonzero(np.isfinite(scales.error))
+        self.counted = np.flatnonzero(np.isfinite(scales.error))
         self.link = len(self.moving)
-        late = self.delay * len(self.slots) + len(self.counted) if self.delay else 0
+        late = self.delay * self.h + len(self.counted) if self.delay else 0
         self.sizes = (self.h + self.order + late, self.link * (self.delay + 1), n + q)
         self.q_rows = np.zeros((self.sizes[1], sum(self.sizes)))
         self.channels = [""] * self.sizes[1]
@@ -205,34 +205,27 @@ class _Assembly:
         C[shown, places] = 1 / self.scales.error[shown]
         if self.delay:
             start = np.zeros((n_xi, h))
-            start[h + order + np.arange(len(self.slots)), self.slots] = 1.0
+            start[h + order : h + order + h] = np.eye(h)
             start[n_xi - len(shown) :, :n] = np.eye(n)[shown]
         return ErrorSystem(A, L, B, M, D, C, self.observer.sample_period_s, tuple(self.channels), E, start)
 
     def late(self, after: Array) -> list[Array]:
         """Return what follows with a delay: measured error, its residuals, latest first, and predicted error."""
-        width, inside = len(self.slots), [i for i in self.slots if i < self.n]
-        held = [self.rows(0, self.h + self.order + i * width, width) for i in range(self.delay)]
-        enters, arriving = np.eye(self.h)[:, self.slots], np.zeros((width, sum(self.sizes)))
-        arriving[: len(inside)] = self.rows(2, 0, self.n, self.scales.residual)[inside]
-        measured = ahead = after + enters @ held[-1]
+        held = [self.rows(0, self.h * (i + 1) + self.order, self.h) for i in range(self.delay)]
+        arriving = np.zeros((self.h, sum(self.sizes)))
+        arriving[: self.n] = self.rows(2, 0, self.n, self.scales.residual)
+        measured = ahead = after + held[-1]
         for i in range(1, self.delay + 1):
             ahead = self.predicted(ahead, i * self.link)
-            ahead = ahead + enters @ (held[self.delay - 1 - i] if i < self.delay else arriving)
+            ahead = ahead + (held[self.delay - 1 - i] if i < self.delay else arriving)
         return [measured, arriving, *held[:-1], ahead[self.counted]]
-
-
-def _driven(observer: ObserverData, scales: ReliftScales, h: int) -> list[int]:
-    """Return the errors, of h, that a residual or a start drives: internal states start at zero."""
-    n = observer.lifting.n_states
-    return [i for i in range(h) if i < n - observer.internal or i >= n or scales.residual[i] > 0]
 
 
 def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> Array:
     """Return the sizes of xi, shape (n_xi,), from those of the errors, shape (n_window,)."""
     delay = observer.runtime.delay
     counted = errors[: len(scales.error)][np.isfinite(scales.error)]
-    late = [*[errors[_driven(observer, scales, len(errors))]] * delay, counted] if delay else []
+    late = [*[errors] * delay, counted] if delay else []
     return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
 
 

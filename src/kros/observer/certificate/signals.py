@@ -66,8 +66,7 @@ class SignalBound:
 
 def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: EpisodeBatch) -> SignalBound:
     """Bound errors for signals like those of training episodes as their sensor shows them, of which none is lost."""
-    seen, n = course(observer, batch), len(observer.recorded)
-    units, sizes = tuple(dict.fromkeys(batch.units)), certificate.scales.error[:n].copy()
+    seen, units, sizes = course(observer, batch), tuple(dict.fromkeys(batch.units)), certificate.scales.error
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)
 
@@ -76,20 +75,19 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
         inside = np.where(batch.inside[: len(signal), :, None], signal, 0.0)
         return np.sqrt(member @ (np.sum(inside**2, axis=0) / batch.lengths[:, None]))
 
-    errors = rms(seen.error[..., :n] + seen.beyond)
+    errors = rms(seen.error + seen.beyond)
     result = SignalBound(observer.recorded, units, np.full(errors.shape, np.inf), errors, sizes)
     if not certificate.certified:
         return replace(result, reason="it has no certificate at run time")
-    ones = np.ones(observer.lifting.n_states), np.ones(len(observer.measured))
-    scales = ReliftScales(certificate.scales.error, *ones)
+    scales = replace(ReliftScales.ones(observer), error=sizes)
     system = replace(certificate, scales=scales).system(observer)
     w = np.concatenate([seen.omega, seen.noise], axis=-1)
     frozen, acted = (rms(signal) for signal in frozen_response(system, w, seen.first))
     share = np.maximum(acted.max(axis=0), TINY)
-    gains, moving = mismatch_gains(system, share, n), np.linalg.norm(acted / share, axis=1)[:, None]
+    gains, moving = mismatch_gains(system, share), np.linalg.norm(acted / share, axis=1)[:, None]
     with np.errstate(invalid="ignore"):
         added = np.where(moving > 0, gains * moving, 0.0)
-    bounds, refused = sizes * (1 + AGREED) * (frozen[:, :n] + added) + rms(seen.beyond), member @ seen.refused
+    bounds, refused = sizes * (1 + AGREED) * (frozen + added) + rms(seen.beyond), member @ seen.refused
     outside = tuple(unit for unit, some in zip(units, refused, strict=True) if some)
     bounds[[unit in outside for unit in units]] = np.inf
     reason = "" if np.isfinite(gains).all() else "what slopes can add has no proven gain"
@@ -103,13 +101,13 @@ def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array,
     return xi @ system.C.T, xi @ system.M.T + w @ system.D.T
 
 
-def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
-    """Return proven gains from what the channels act on, over sizes, to what they add to each of n errors."""
+def mismatch_gains(system: ErrorSystem, acted: Array) -> Array:
+    """Return proven gains from what the channels act on, over sizes, to what they add to each of the errors."""
     if not len(acted):
-        return np.zeros(n)
+        return np.zeros(len(system.C))
     rest, top = system.mismatch(), float(acted.max())
     rest = replace(rest, B=rest.B * (acted / top), D=rest.D * (acted / top))  # else gains underflow where little moves
-    alone = (np.arange(len(rest.C))[:, None] == j for j in range(n))
+    alone = np.eye(len(rest.C))[..., None]
     return np.array([proven_gain(replace(rest, C=one * rest.C)) * top for one in alone])
 
 
@@ -117,7 +115,7 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
 class Course:
     """What drove the error of an observer along recorded episodes, and the error."""
 
-    omega: Array  # (n_samples - 1, batch, n): one-step residual; zero in internal states
+    omega: Array  # (n_samples - 1, batch, n): one-step residual
     noise: Array  # (n_samples - 1, batch, q): what the sensor shows beside the recording, as it arrives
     first: Array  # (batch, n_window): first error, with the earlier ones that the lifting reads, which equal it
     error: Array  # (n_samples, batch, n)
@@ -150,9 +148,7 @@ def held_residual(observer: ObserverData, states: Array, inputs: Array, paramete
     h = observer.lifting.history
     if h:
         states, inputs = (np.concatenate([np.repeat(v[:1], h, axis=0), v]) for v in (states, inputs))
-    residual = one_step_residual(observer.lifting, observer.A, observer.B, states, inputs, parameters)
-    residual[..., len(observer.recorded) :] = 0.0
-    return residual
+    return one_step_residual(observer.lifting, observer.A, observer.B, states, inputs, parameters)
 
 
 def first_error(observer: ObserverData, error: Array) -> Array:

@@ -23,7 +23,6 @@ from ...identify.free_run import recursion
 from ..data import ObserverData
 from ..residual import one_step_residual
 from ..screen import screened
-from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem, ReliftScales
 from .proof import proven_gain
@@ -36,7 +35,6 @@ class SignalBound:
     states: Names  # of the recordings
     units: Names
     bounds: Array  # (units, n), on RMS errors for what the recordings of a unit hold; infinite where there is none
-    errors: Array  # (units, n), RMS errors as they were
     sizes: Array  # (n,), ranges of the states
     reason: str = ""  # why there is no bound
     outside: Names = ()  # units of which the observer refuses samples as implausible; their rows are infinite
@@ -75,8 +73,7 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
         inside = np.where(batch.inside[: len(signal), :, None], signal, 0.0)
         return np.sqrt(member @ (np.sum(inside**2, axis=0) / batch.lengths[:, None]))
 
-    errors = rms(seen.error + seen.beyond)
-    result = SignalBound(observer.recorded, units, np.full(errors.shape, np.inf), errors, sizes)
+    result = SignalBound(observer.recorded, units, np.full((len(units), len(sizes)), np.inf), sizes)
     if not certificate.certified:
         return replace(result, reason="it has no certificate at run time")
     scales = replace(ReliftScales.ones(observer), error=sizes)
@@ -113,12 +110,11 @@ def mismatch_gains(system: ErrorSystem, acted: Array) -> Array:
 
 @frozen
 class Course:
-    """What drove the error of an observer along recorded episodes, and the error."""
+    """What drove the error of an observer along recorded episodes."""
 
     omega: Array  # (n_samples - 1, batch, n): one-step residual
     noise: Array  # (n_samples - 1, batch, q): what the sensor shows beside the recording, as it arrives
     first: Array  # (batch, n_window): first error, with the earlier ones that the lifting reads, which equal it
-    error: Array  # (n_samples, batch, n)
     refused: Flags  # (batch,): whether the observer refuses a sample
     beyond: Array  # (n_samples, batch, n_recorded): what recorded states are beyond declared limits, by noise
 
@@ -131,7 +127,6 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     values = {**observer.parameters, **observer.own(batch.parameters)}
     due = np.maximum(np.arange(len(states)) - late, 0)
     y = batch.states[due][..., at] if batch.shown is None else batch.measurements(at, arrived=False)
-    estimates = run_observer(observer, y, inputs, values)
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
     samples = screened(observer, y, inputs)
     bad = ~np.isfinite(samples.y).all(axis=-1) | (samples.u != inputs).any(axis=-1)
@@ -140,7 +135,7 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     noise[:late] = 0.0
     omega = held_residual(observer, states, inputs, values)
     first = first_error(observer, states[0] - observer.initial(samples.y[0], values))
-    return Course(omega, noise, first, states - estimates, refused, batch.states - states)
+    return Course(omega, noise, first, refused, batch.states - states)
 
 
 def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Parameters) -> Array:

@@ -129,4 +129,4 @@ def left_out_bound(
     """Return the bound on RMS errors, the largest of left-out units, beside the errors (units, n) of training."""
     worst = np.array([worst_percent[name] for name in observer.recorded]) * sizes / 100
     bound = np.maximum(worst, errors.max(axis=0)) + np.zeros_like(errors)  # one for all units
-    return SignalBound(observer.recorded, tuple(units), bound, errors, sizes)
+    return SignalBound(observer.recorded, tuple(units), bound, sizes)

@@ -112,7 +112,7 @@ def solve(task: DesignTask) -> tuple[str, float, bool]:
     judge, found = task.training.read(), result.synthesis
     problem, models = replace(task.problem, injection=found.injection), task.models
     idle = gain(np.zeros((models.lifting.n_lifted, len(models.measured))), models.sample_period_s)
-    nothing, _ = certify_errors(problem, problem.error_system(idle))
+    nothing = certify_errors(problem, problem.error_system(idle))
     error, free = percent_of([result.observer, task.observer(task.open_loop())], judge)
     return (
         f"{n_states:2d} states, K {found.controller.n_states:2d} {found.status.value:10s} {used:6.2f} s ({wall:6.2f} s wall) "

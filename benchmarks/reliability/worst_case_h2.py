@@ -222,7 +222,7 @@ def other_observers(
 def value_of(problem: ObserverProblem, K: StateSpace) -> float:
     """Certified value; infinite where there is none."""
     try:
-        return certify_errors(problem, problem.error_system(K))[0]
+        return certify_errors(problem, problem.error_system(K))
     except SynthesisError:
         return np.inf
 

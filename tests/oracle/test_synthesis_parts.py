@@ -21,6 +21,5 @@ def test_a_certificate_sees_resonances_that_a_grid_passes_over(angle):
     weights, scales = (gain([[0.01]], DT), gain([[1.0]], DT)), ([1.0], [1.0, 1.0], [0.1])
     case = ObserverProblem(nominal, [[1.0, 0.0]], *weights, *scales, form="input_multiplicative")
     nothing = gain(np.zeros((2, 1)), DT)
-    value, error = certify_errors(case, case.error_system(nothing))
+    value = certify_errors(case, case.error_system(nothing))
     assert value == pytest.approx(0.01 * h2_norm(nominal), rel=1e-4)
-    assert error < 1e-3 * value

@@ -213,7 +213,7 @@ def certificate(task: DesignTask, design: Design) -> Record:
     try:
         errors, mean = error_maps(task, design, problem)
         facts["spectral_radius_max"] = float(max(errors.spectral_radius(), task.models.spectral_radius().max()))
-        bound = certify_errors(problem, errors, mean)[0]
+        bound = certify_errors(problem, errors, mean)
         if observer.bank is not None:
             facts["constant_h2"] = float(np.linalg.norm(mean))
             require_useful(problem, observer, bound)
@@ -227,7 +227,7 @@ def require_useful(problem: ObserverProblem, observer: Observer, bound: float) -
     """Refuse a bound that is no better than without an estimate: models relate states less closely than machines."""
     rows, dt = problem.nominal.n_outputs, problem.nominal.dt
     nothing = gain(np.zeros((rows, len(observer.measured) + rows + problem.nominal.n_inputs)), dt)
-    without = certify_errors(problem, problem.estimate_error(nothing))[0]
+    without = certify_errors(problem, problem.estimate_error(nothing))
     if bound >= without:
         raise SynthesisError(
             f"the bound over the set is {bound:.3g}, without an estimate {without:.3g}: machines relate states more "

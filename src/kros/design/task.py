@@ -158,11 +158,6 @@ class DesignTask:
         """Return the design of a synthesis that corrects the nominal model."""
         return Design(self.name, self.observer(synthesis), synthesis, facts)
 
-    @property
-    def selector(self) -> Array:
-        """Matrix that selects the measured states."""
-        return np.eye(self.models.lifting.n_lifted)[list(self.models.measured)]
-
     def require_problem(self) -> ObserverProblem:
         """Return the uncertain set, or say why there is none."""
         if self.problem is None:

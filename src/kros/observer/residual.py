@@ -31,7 +31,7 @@ from itertools import combinations
 
 import numpy as np
 
-from ..core import TINY, AnyArray, Array, ArrayLike, Columns, DataError, Parameters, Record, frozen
+from ..core import TINY, Array, ArrayLike, Columns, DataError, Parameters, Record, frozen
 from ..data import EpisodeBatch
 from ..lifting import Lifting
 from ..synthesis.residual_shaped.residual_h2 import ResidualProblem, promised_errors
@@ -124,8 +124,7 @@ class ResidualModel:
     refitted: tuple[int, ...]
     A: Array  # (n_lifted, n_lifted)
     B: Array  # (n_lifted, m)
-    dynamics: Array  # (n, n)
-    spectra: AnyArray  # (unit, f, n, n)
+    problem: ResidualProblem
     promised: Array  # (n,)
 
 
@@ -171,10 +170,9 @@ def residual_models(
     for rows in _choices(tuple(measured), hidden):
         model, columns = with_rows(A, B, *fitted, rows), [i + n * (i in rows) for i in range(n)]
         dynamics, chosen = mean_error_dynamics(model[0], slopes), spectra[..., columns, :][..., columns]
-        promised = promised_errors(
-            ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s)
-        )
-        models.append(ResidualModel(rows, *model, dynamics, chosen, promised))
+        C, period = np.eye(n)[list(measured)], batch.sample_period_s
+        problem = ResidualProblem(dynamics, C, chosen, noise, scale, period)
+        models.append(ResidualModel(rows, *model, problem, promised_errors(problem)))
     return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], TINY)))))
 
 

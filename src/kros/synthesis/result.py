@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from enum import Enum
 
-from ..core import AGREED, Names, StateSpace, Storable, SynthesisError, frozen
+from ..core import AGREED, Names, StateSpace, Storable, frozen
 
 log = logging.getLogger(__name__)
 
@@ -77,14 +77,8 @@ class Synthesis(Storable):
     worst_case_h2: float | None = None  # certified for every member of the uncertain set
     lower_bound: float | None = None  # no controller of this kind does better
     gap_percent: float | None = None  # ``100 (value / lower_bound - 1)``
-    quadrature_error: float | None = None  # of `worst_case_h2`, already included in it
     spectral_radius: float | None = None  # of the nominal loop (continuous: the largest real part)
     notes: Names = ()
-
-    def __post_init__(self) -> None:
-        if self.gap_percent is not None and not self.gap_percent >= 0:
-            problem = f"a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %)"
-            raise SynthesisError(f"Synthesis {self.method}: {problem}; please report the plant.")
 
 
 def enclosed(value: float, lower: float | None) -> tuple[float | None, float | None, Names]:

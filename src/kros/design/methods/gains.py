@@ -22,7 +22,7 @@ from ...observer.residual import (
     with_rows,
 )
 from ...synthesis import Synthesis, kalman
-from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
+from ...synthesis.residual_shaped.residual_h2 import residual_h2
 from ..task import Design, DesignTask, Label, Method
 from ..training import hidden_mean, percent_of
 
@@ -53,7 +53,7 @@ class KalmanTuned(Method):
         A, B = with_rows(models.A[nominal], models.B[nominal], *one_step_rows(lifting, batch))
         covariance = residual_covariance(lifting, A, B, batch)
         dynamics = mean_error_dynamics(A, mean_slopes(lifting, batch.states, batch.inputs, batch.parameters))
-        noise, C = np.diag(task.noise**2), task.selector[:, :n]
+        noise, C = np.diag(task.noise**2), np.eye(n)[list(models.measured)]
         candidates = _candidates(dynamics, C, covariance, noise, models.sample_period_s)
         more = (0, lifting.n_lifted - n), (0, 0)  # rows of zeros for the lifted functions
         tried = [
@@ -91,18 +91,18 @@ class ResidualH2(Method):
 
     def design(self, task: DesignTask) -> Design:
         """Return the best of the models that promise the smallest errors."""
-        given, n, row = task.models, task.models.lifting.n_states, task.models.index(task.unit)
-        C, scale, dt = task.selector[:, :n], given.output_scale[:n], given.sample_period_s
+        given, row = task.models, task.models.index(task.unit)
         nominal = given.lifting, given.A[row], given.B[row], given.measured
-        tried = residual_models(*nominal, task.training.read(), task.noise, scale)
+        tried = residual_models(
+            *nominal, task.training.read(), task.noise, given.output_scale[: given.lifting.n_states]
+        )
         models = [model for model in tried if np.isfinite(model.promised).all()][: self.compared]
         if not models:
             raise SynthesisError(
                 "Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings."
             )
-        problems = [ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
         lifted, order = given.lifting.n_lifted, self.correction_order
-        syntheses = [residual_h2(problem, n_lifted=lifted, order=order) for problem in problems]
+        syntheses = [residual_h2(model.problem, n_lifted=lifted, order=order) for model in models]
         observers = [task.observer(one, (model.A, model.B)) for model, one in zip(models, syntheses, strict=True)]
         best, error = task.best(observers)
         if not np.isfinite(error):

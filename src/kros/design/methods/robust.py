@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...core import Record, StateSpace, frozen, gain
+from ...core import StateSpace, frozen, gain
 from ...identify.model_set import EDMD
 from ...synthesis import Injection, ObserverProblem, mixed, worst_case_h2
 from ...uncertainty import residual
@@ -45,8 +45,7 @@ class Published(Mixed):
         weights = self.weights(task)
         solved = mixed(as_published(task.require_problem(), weights.system), steps=self.steps)
         note = f"The weights bound entries: a full perturbation exceeds them {weights.excess:.3g} times."
-        nothing: Record = {"worst_case_h2": None, "quadrature_error": None}
-        published = replace(solved, method=self.name, notes=(*solved.notes, note), **nothing)
+        published = replace(solved, method=self.name, notes=(*solved.notes, note), worst_case_h2=None)
         return task.designed(published, unstructured_excess=weights.excess)
 
     def weights(self, task: DesignTask) -> EntryWeights:

@@ -221,18 +221,14 @@ class ObserverProblem:
         """The controller that corrects nothing."""
         return gain(np.zeros((self.injection_matrix.shape[1], len(self.C))), self.nominal.dt)
 
-    def require_sound(self) -> float:
-        """Check that the set is well posed and the observer possible; return ``||N||``, zero without a loop.
+    def require_sound(self) -> None:
+        """Check that the set is well posed and the observer possible.
 
         Raises
         ------
         SynthesisError
             For an unstable nominal model or weight, an undetectable pair, or ``||N|| >= 1``.
         """
-        return self._soundness
-
-    @cached_property
-    def _soundness(self) -> float:
         if self.nominal.dt == 0:
             raise SynthesisError("Observer synthesis works in discrete time, found a continuous model; sample it.")
         require_detectable(self.nominal.A, self.C, self.nominal.dt, "Observer synthesis")
@@ -248,7 +244,6 @@ class ObserverProblem:
                 f"{self.form.value.replace('_', ' ')} uncertainty, otherwise the set contains ill-posed "
                 "plants; choose another form or nominal, or leave outliers out."
             )
-        return size
 
     def error_plant(self) -> GeneralizedPlant:
         """Unweighted error system, scaled.

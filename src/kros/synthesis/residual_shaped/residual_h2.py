@@ -169,14 +169,6 @@ class ResidualProblem:
         loop = self.loop(shaping, K)
         return np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, loop.dt) @ loop.C.T), TINY))
 
-    def unit_errors(self, K: StateSpace) -> AnyArray:
-        """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
-        f, n = self.spectra.shape[1:3]
-        response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / K.dt, f))
-        weight, drive, rest = circle_weights(f), response[..., :n], response[..., n:]
-        driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.scaled_spectra, drive.conj(), optimize=True).real
-        return driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2)
-
     def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, most: int) -> StateSpace:
         """Correction filter of the lowest order within the tolerance, by bisection over balanced truncations."""
         best, loop = self.deviations(shaping, K), self.loop(shaping, K)
@@ -230,4 +222,9 @@ def promised_errors(problem: ResidualProblem) -> AnyArray:
         K = problem.correction(problem.filter())
     except SynthesisError:
         return np.full(len(problem.A), np.inf)
-    return np.sqrt(problem.unit_errors(K).mean(axis=0))
+    f, n = problem.spectra.shape[1:3]
+    response = problem.error_system(K).frequency_response(np.linspace(0, 0.5 / K.dt, f))
+    weight, drive, rest = circle_weights(f), response[..., :n], response[..., n:]
+    mean = problem.scaled_spectra.mean(axis=0)
+    driven = np.einsum("f,fia,fab,fib->i", weight, drive, mean, drive.conj(), optimize=True).real
+    return np.sqrt(driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2))

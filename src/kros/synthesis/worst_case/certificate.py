@@ -45,11 +45,8 @@ def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: AnyArray) ->
     return uncertain**2 + energy(noise)
 
 
-def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> tuple[float, float]:
-    """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error in it, for a system of errors.
-
-    It is the error system from (d, r, n[, s]), with the mean of ``W_p e``.
-    """
+def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray | float = 0.0) -> float:
+    """Return the certified worst-case H2 norm of ``W_p e``, of an error system from (d, r, n[, s]) and the mean."""
     problem.require_sound()
     if not errors.is_stable():
         radius = float(errors.spectral_radius())
@@ -59,9 +56,7 @@ def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: AnyArray 
     poles = np.concatenate([s.poles() for s in systems if s is not None]).astype(complex)
     poles = poles[(poles.imag >= 0) & (np.abs(poles) > 1e-3)]
     squared, error = circle_mean(lambda theta: density(problem, errors, theta / rate), np.log(poles), _ACCURACY)
-    squared += float(np.sum(np.square(mean)))
-    upper = float(np.sqrt(squared + error))
-    return upper, upper - float(np.sqrt(squared))
+    return float(np.sqrt(squared + error + np.sum(np.square(mean))))
 
 
 def circle_mean(density: Callable[[AnyArray], AnyArray], centers: AnyArray, rtol: float) -> tuple[float, float]:

@@ -7,7 +7,6 @@ from numpy.linalg import norm, svd
 
 from kros.core.linalg import adjoint, energy
 from kros.synthesis.worst_case.ball import uncertain_ball
-from kros.synthesis.worst_case.certificate import _responses
 
 FREQUENCIES = 4000
 
@@ -16,10 +15,13 @@ def attained(problem, errors, mean=0.0):
     """Return the norm of `W_p e` for a perturbation that is locally worst at every frequency; without the remainder."""
     nyquist = 0.5 / problem.nominal.dt
     freqs = (np.arange(FREQUENCIES) + 0.5) / FREQUENCIES * nyquist
-    _, T, certain, noise = _responses(problem, errors, freqs)
+    m, n = problem.nominal.n_inputs, problem.nominal.n_states
+    d, r, noise, s = np.split(errors.frequency_response(freqs), [m, m + n, m + n + len(problem.C)], axis=-1)
+    T = (d if problem.form.at_input else r) @ problem.W_L.frequency_response(freqs)
+    certain = s @ problem.input_weight.frequency_response(freqs) if s.size else 0.0
     ball = uncertain_ball(problem, freqs)
     response = certain + T @ (ball.center + ball.left @ worst(ball, T, certain) @ ball.right)
-    return float(np.sqrt(np.mean(energy(response) + noise) + np.sum(np.square(mean))))
+    return float(np.sqrt(np.mean(energy(response) + energy(noise)) + np.sum(np.square(mean))))
 
 
 def worst(ball, T, certain, iterations=15):

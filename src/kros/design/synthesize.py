@@ -207,10 +207,12 @@ def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Se
 
 def _designed(tasks: Sequence[DesignTask], work: Work) -> tuple[dict[str, Design], dict[str, str]]:
     """Return designs, and reasons of those that failed; the last methods start first, since they take longest."""
-    results = [*work.map("synthesize", _design, tasks[::-1])][::-1]
-    named = [(task.name, result) for task, result in zip(tasks, results, strict=True)]
-    designs = {name: result for name, result in named if isinstance(result, Design)}
-    return designs, {name: result for name, result in named if isinstance(result, str)}
+    places = {method.name: place for place, method in enumerate(METHODS)}
+    order = sorted(tasks, key=lambda task: -places.get(task.method.name, len(places)))
+    results = dict(zip((task.name for task in order), work.map("synthesize", _design, order), strict=True))
+    results = {task.name: results[task.name] for task in tasks}
+    designs = {name: result for name, result in results.items() if isinstance(result, Design)}
+    return designs, {name: result for name, result in results.items() if isinstance(result, str)}
 
 
 def _design(task: DesignTask) -> Design | str:

@@ -197,14 +197,14 @@ def test_tasks_run_alone_with_one_thread_and_their_errors_come_back(cluster, tmp
     monkeypatch.setattr("kros.study.engine.executors._BATCHES", 4)
     address = cluster.start(2)
     with open_executor(scheduler=address) as executor:
-        assert list(executor.map(square, range(30))) == [x * x for x in range(30)]
-        assert list(executor.map(square, [])) == []
-        assert set().union(*executor.map(threads, range(4))) == {1}
-        assert all(executor.map(partial(alone, folder=tmp_path), range(8)))
+        assert list(executor(square, range(30))) == [x * x for x in range(30)]
+        assert list(executor(square, [])) == []
+        assert set().union(*executor(threads, range(4))) == {1}
+        assert all(executor(partial(alone, folder=tmp_path), range(8)))
         with pytest.raises(DataError, match="Unit 7: is not finite"):
-            list(executor.map(refuse, [7]))
+            list(executor(refuse, [7]))
         with pytest.raises(KrosError, match="nowhere; recordings and run folder must be in a shared folder"):
-            list(executor.map(missing, [tmp_path]))
+            list(executor(missing, [tmp_path]))
     if len(os.sched_getaffinity(0)) > 1:  # else one thread is all there is
         with distributed.Client(address, set_as_default=False) as client:
             assert client.submit(threads, 0).result() != {1}
@@ -216,12 +216,12 @@ def test_workers_have_the_same_kros(cluster, monkeypatch):
         open_executor(scheduler=cluster.start(1)) as executor,
         pytest.raises(KrosError, match="install the same version on every worker"),
     ):
-        list(executor.map(square, [0]))
+        list(executor(square, [0]))
 
 
 def test_a_task_whose_worker_ends_runs_again_on_another(cluster, tmp_path):
     with open_executor(scheduler=cluster.start(2)) as executor:
-        assert list(executor.map(partial(die_once, folder=tmp_path), range(6))) == list(range(6))
+        assert list(executor(partial(die_once, folder=tmp_path), range(6))) == list(range(6))
     assert (tmp_path / "died").exists()
 
 
@@ -250,7 +250,7 @@ def test_a_run_whose_scheduler_is_lost_says_so_and_goes_on_with_another(cluster,
 
 def test_work_that_ends_every_worker_is_given_up(cluster):
     with open_executor(scheduler=cluster.start(2)) as executor, pytest.raises(KrosError, match="ended several workers"):
-        list(executor.map(die, [0]))
+        list(executor(die, [0]))
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense"])

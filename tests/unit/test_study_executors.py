@@ -38,21 +38,21 @@ def die(_: int) -> None:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_order_and_warnings_about_numbers_are_errors(workers):
     with open_executor(workers) as executor:
-        assert list(executor.map(square, range(5))) == [0, 1, 4, 9, 16]
+        assert list(executor(square, range(5))) == [0, 1, 4, 9, 16]
         work = Work(executor)
         results, wrong = work.begin("first", (partial(square, x) for x in range(5))), work.begin("wrong", [refuse])
         assert work.run("meanwhile", [partial(square, 9)]) == [81]
         assert results() == [0, 1, 4, 9, 16]
         with pytest.raises(KrosError, match="as it should"):
             wrong()
-        assert list(executor.map(overflow, [1.0])) == [1e300]
+        assert list(executor(overflow, [1.0])) == [1e300]
         with pytest.raises(RuntimeWarning, match="overflow"):
-            list(executor.map(overflow, [1.0, 1e300]))
+            list(executor(overflow, [1.0, 1e300]))
 
 
 def test_work_that_is_abandoned_is_not_waited_for():
     with pytest.raises(RuntimeError, match="enough"), open_executor(2) as executor:  # noqa: PT012
-        executor.map(endless, range(3))
+        executor(endless, range(3))
         assert len(multiprocessing.active_children()) == 2
         raise RuntimeError("enough")
     assert not multiprocessing.active_children()
@@ -60,4 +60,4 @@ def test_work_that_is_abandoned_is_not_waited_for():
 
 def test_a_worker_that_is_ended_from_outside_is_an_error_with_a_remedy():
     with pytest.raises(KrosError, match="fewer workers"), open_executor(2) as executor:
-        list(executor.map(die, range(3)))
+        list(executor(die, range(3)))

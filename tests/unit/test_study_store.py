@@ -1,13 +1,14 @@
 """Artefacts and results: what is in its place is whole, and as it was written."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
 
 from kros.core.artifacts import digest_of
 from kros.core.errors import ConfigError
-from kros.core.work import Results, Storing, Work, _read
+from kros.core.work import Results, Work, _read, stored
 from kros.study.engine.store import Store
 
 
@@ -92,7 +93,7 @@ def test_what_is_in_the_place_of_a_result_is_named(tmp_path, name):
     ids=range(5),
 )
 def test_results_come_back_bit_by_bit(tmp_path, kind, value):
-    store, (one, other) = Storing(lambda task: task), (tmp_path / name for name in "ab")
+    store, (one, other) = partial(stored, lambda task: task), (tmp_path / name for name in "ab")
     store((one, value))
     again = _read(one, kind, lambda result: True)
     store((other, again))
@@ -102,7 +103,7 @@ def test_results_come_back_bit_by_bit(tmp_path, kind, value):
 
 def test_a_result_of_another_kind_is_refused(tmp_path):
     with pytest.raises(TypeError, match="object is not JSON"):
-        Storing(lambda task: task)((tmp_path / "a", [object()]))
+        stored(lambda task: task, (tmp_path / "a", [object()]))
 
 
 def test_results_of_a_map_that_was_interrupted_are_there(tmp_path):

@@ -24,7 +24,7 @@ from .lti import StateSpace, block_diagonal, gain
 from .norms import h2_norm, hinf_norm
 from .rounding import AGREED, EPS, ITERATED, ROUNDING, SINGULAR, TINY
 from .settings import Settings, member, require_kind
-from .work import Executor, Progress, Work, grouped
+from .work import Mapped, Progress, Work, grouped
 
 __all__ = [
     "ConfigError",

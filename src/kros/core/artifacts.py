@@ -9,8 +9,6 @@ import hashlib
 import io
 import json
 import math
-import struct
-import tokenize
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -33,8 +31,6 @@ from .files import pass_on_shortage, read_bytes, shortened, write_bytes
 SCHEMA = 1
 CHECKSUM, _ARRAY = "checksum", "array in arrays.npz"
 _AGAIN = "write it again with the step that made it"
-_DAMAGED: tuple[type[Exception], ...] = (zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, OSError)
-_DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, MemoryError)
 
 
 def plain(value: Any) -> Any:
@@ -112,7 +108,7 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
         if not all(isinstance(array, np.ndarray) for array in arrays.values()):
             raise ValueError("a part of it is no array")
         return arrays
-    except _DAMAGED as error:
+    except Exception as error:  # what damaged archives raise has no common base
         pass_on_shortage(error, path)
         raise DataError(f"Reading {path}: not a valid archive ({error or type(error).__name__}); {_AGAIN}.") from error
 
@@ -190,7 +186,7 @@ class Storable:
 
 def divided(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
     """Return a value in JSON's types, numbers that JSON has not as texts, and its arrays by where they are in it."""
-    arrays = dict[str, np.ndarray]()
+    arrays = {}
 
     def plain_of(part: Any, name: str) -> Any:
         if isinstance(part, np.ndarray):

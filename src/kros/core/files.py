@@ -22,10 +22,7 @@ TEMPORARY = ".kros."  # how names begin of what is beside its place until it is 
 
 def is_file(path: Path) -> bool:
     """Tell whether there is a regular file, not a link to one."""
-    try:
-        return stat.S_ISREG(path.lstat().st_mode)
-    except (OSError, ValueError):
-        return False
+    return os.path.isfile(path) and not os.path.islink(path)
 
 
 def stamp_of(path: Path) -> tuple[int, int]:
@@ -53,8 +50,7 @@ def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> by
     """Return the content of a regular file of at most `limit` bytes."""
     require_regular(path, limit, error)
     try:
-        with path.open("rb") as file:  # Python allocates as much as is asked for
-            return file.read(min(limit, os.fstat(file.fileno()).st_size) + 1)
+        return path.read_bytes()
     except OSError as failure:
         raise error(f"Reading {path}: {failure}; check the file and its permissions.") from failure
 
@@ -121,6 +117,6 @@ def shortened(text: str, longest: int = 300) -> str:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return a hint for a message where a name is nearly one that is known, else nothing."""
+    """Return a hint for a message where a name is nearly one that is known, else the end of a clause."""
     close = get_close_matches(str(name), list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    return f"; did you mean {close[0]!r}?" if close else ";"

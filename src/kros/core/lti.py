@@ -89,6 +89,11 @@ class StateSpace:
             raise DimensionError(f"State space: {problem}; convert it first.") from error
 
     @property
+    def matrices(self) -> tuple[AnyArray, ...]:
+        """A, B, C and D."""
+        return self.A, self.B, self.C, self.D
+
+    @property
     def n_states(self) -> int:
         """Number of states."""
         return self.A.shape[-1]
@@ -106,12 +111,12 @@ class StateSpace:
     @property
     def batch_shape(self) -> tuple[int, ...]:
         """Leading axes shared by the four matrices."""
-        return np.broadcast_shapes(*(getattr(self, name).shape[:-2] for name in "ABCD"))
+        return np.broadcast_shapes(*(matrix.shape[:-2] for matrix in self.matrices))
 
     def __getitem__(self, index: Any) -> StateSpace:
         """Return one system, or a smaller batch, of a batch."""
-        shape, matrices = self.batch_shape, (self.A, self.B, self.C, self.D)
-        A, B, C, D = (np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in matrices)
+        shape = self.batch_shape
+        A, B, C, D = (np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in self.matrices)
         return StateSpace(A, B, C, D, self.dt)
 
     def poles(self) -> AnyArray:
@@ -128,7 +133,7 @@ class StateSpace:
 
     def is_finite(self) -> bool:
         """Tell whether no matrix contains NaN or infinity."""
-        return all(np.isfinite(getattr(self, name)).all() for name in "ABCD")
+        return all(np.isfinite(matrix).all() for matrix in self.matrices)
 
     def multiplied(self, outputs: AnyArray, inputs: AnyArray) -> StateSpace:
         """Return the system with its outputs (p,) and inputs (m,) multiplied."""
@@ -190,5 +195,5 @@ def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
         periods = [s.dt for s in systems]
         raise DimensionError(f"Block diagonal: needs one sampling period, found {periods} s; resample first.")
 
-    A, B, C, D = (block_diag(*(getattr(s, name) for s in systems)) for name in "ABCD")
+    A, B, C, D = map(block_diag, *(s.matrices for s in systems))
     return StateSpace(A, B, C, D, systems[0].dt)

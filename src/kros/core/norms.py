@@ -226,7 +226,7 @@ def first_frequencies(poles: AnyArray) -> AnyArray:
 
 def crossings(system: StateSpace, gamma: float) -> AnyArray:
     """Frequencies at which a singular value may equal `gamma`, with the points between them."""
-    A, B, C, D = system.A, system.B, system.C, system.D
+    A, B, C, D = system.matrices
     R = gamma**2 * np.eye(system.n_inputs) - D.T @ D
     F, n = np.linalg.solve(R, np.hstack([D.T @ C, B.T])), system.n_states
     closed = A + B @ F[:, :n]
@@ -259,7 +259,7 @@ def precise_h2_norm(system: StateSpace) -> float:
 
 def _norm_of(mp: Any, system: StateSpace) -> float:
     """``tr(C P C' + D D')``, the Gramian P summed by doubling; infinite where powers of A do not vanish."""
-    A, B, C, D = (mp.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C, system.D))
+    A, B, C, D = (mp.matrix(matrix.tolist()) for matrix in system.matrices)
     if system.dt == 0:  # the bilinear map keeps the Gramian
         inverse = mp.inverse(mp.eye(A.rows) - A)
         A, B = inverse * (mp.eye(A.rows) + A), mp.sqrt(2) * inverse * B
@@ -279,6 +279,6 @@ def precise_gain(system: StateSpace, freq_hz: float) -> float:
     with mpmath.workdps(_DIGITS[0]):
         s = mpmath.mpc(0, 2 * mpmath.pi * mpmath.mpf(freq_hz))
         point = mpmath.exp(s * mpmath.mpf(system.dt)) if system.dt > 0 else s
-        A, B, C, D = (mpmath.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C, system.D))
+        A, B, C, D = (mpmath.matrix(matrix.tolist()) for matrix in system.matrices)
         response = C * mpmath.inverse(point * mpmath.eye(system.n_states) - A) * B + D
         return float(np.linalg.norm(np.array(response.tolist(), complex), 2))

@@ -49,7 +49,7 @@ class Settings(BaseModel):
     def _explain(cls, error: Any) -> str:
         if error["type"] == "extra_forbidden":
             known = cls._names_in(error["loc"][:-1])
-            return f"unknown key{did_you_mean(error['loc'][-1], known) or ';'} known are {', '.join(known)}"
+            return f"unknown key{did_you_mean(error['loc'][-1], known)} known are {', '.join(known)}"
         text, value = error["msg"].removeprefix("Value error, "), error.get("input")
         text = text[:1].lower() + text[1:]
         return text if isinstance(value, dict) else f"{text}, found {shortened(repr(value))}"

@@ -26,12 +26,8 @@ from .limits import MAX_ARRAYS_BYTES
 log = logging.getLogger(__name__)
 
 
-class Executor:
-    """Maps a function over tasks: here, one behind the other; others derive from it."""
-
-    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks."""
-        return map(function, tasks)
+# what maps a function over tasks, as `map` does: results are in the order of the tasks
+Mapped = Callable[..., Iterator[Any]]
 
 
 class Progress:
@@ -77,34 +73,28 @@ def _read(path: Path | None, kind: Any, usable: Callable[[Any], bool]) -> Any:
     return result if usable(result) else None
 
 
-@frozen
-class Storing:
-    """A function of a path and a task, whose result is written where it has a path."""
-
-    function: Callable[[Any], Any]
-
-    def __call__(self, task: tuple[Path | None, Any]) -> Any:
-        """Compute."""
-        path, content = task
-        result = self.function(content)
-        if path is not None:
-            text, arrays = divided(result)
-            write_bytes(path, pack_arrays({"content": np.frombuffer(json_bytes(text), np.uint8), **arrays}))
-        return result
+def stored(function: Callable[[Any], T], task: tuple[Path | None, Any]) -> T:
+    """Return the result of a task, which is written where it has a path."""
+    path, content = task
+    result = function(content)
+    if path is not None:
+        text, arrays = divided(result)
+        write_bytes(path, pack_arrays({"content": np.frombuffer(json_bytes(text), np.uint8), **arrays}))
+    return result
 
 
 @frozen
 class Work:
-    """An executor, a progress listener and earlier results; by default work runs here, in silence, without results."""
+    """What maps, a progress listener and earlier results; by default work runs here, in silence, without results."""
 
-    executor: Executor = field(default_factory=Executor)
+    mapped: Mapped = map
     progress: Progress = field(default_factory=Progress)
     results: Results | None = None
 
     def map(self, title: str, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Map a function over tasks, in order."""
         tasks = list(tasks)
-        return self._followed(title, len(tasks), self.executor.map(function, tasks))
+        return self._followed(title, len(tasks), self.mapped(function, tasks))
 
     def _followed(self, title: str, total: int, results: Iterator[T]) -> Iterator[T]:
         """Yield results, and report progress."""
@@ -131,7 +121,7 @@ class Work:
         new = [pair for pair, result in zip(pairs, earlier, strict=True) if result is None]
         if new:
             log.info("%s: %d of %d are new or changed", title, len(new), len(pairs))
-        computed = self.map(title, Storing(function), new)
+        computed = self.map(title, partial(stored, function), new)
         for result in earlier:
             yield next(computed) if result is None else result
         next(computed, None)  # its progress ends

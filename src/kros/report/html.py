@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..core import ByName, Record, read_json, write_bytes
+from ..core import ByName, Mapped, Record, read_json, write_bytes
 from .content import Section
 from .facts import Facts
 from .figures import Drawn, draw
@@ -22,7 +22,7 @@ from .verdict import judge
 _TEMPLATES = Path(__file__).parent / "templates"
 
 
-def render(run: Path, metrics: ByName, mapped: Callable[..., Iterable[Drawn]] = map, out: Path | None = None) -> Path:
+def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = None) -> Path:
     """Write the report of a run from ``metrics.json``, of which any part but ``study`` may be absent.
 
     `mapped` maps the drawing of a figure over their names, in order, for example in several processes.
@@ -45,12 +45,10 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
 
     light = "".join(f"{t.variable}:{t};" for t in Tone)
     dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)  # the tones of the figures, for light and dark pages
-    style, script = ((_TEMPLATES / f"report.{end}").read_text(encoding="utf-8") for end in ("css", "js"))
-    style = style.replace("/* light tones */", light).replace("/* dark tones */", dark)
     loader, strict = FileSystemLoader(_TEMPLATES), StrictUndefined
     pages = Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
     absent: Record = {"head": None, "evidence": (), "figures": {}}
-    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "style": style, "script": script}
+    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "light": light, "dark": dark}
     return pages.get_template("report.html.jinja").render(absent | parts)
 
 

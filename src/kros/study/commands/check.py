@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...core import TINY, Array, ConfigError, DataError, Executor, Flags, plain
+from ...core import TINY, Array, ConfigError, DataError, Mapped, plain
 from ...data import EpisodeKey, Population
 from ...data.prepare import with_gaps
 from ...data.recording import GroupWatch, check_population, digest_of, refuse_copies, title
@@ -73,13 +73,13 @@ def scored(context: Context, data: Path, workers: int, same_unit: bool) -> Rows:
         modelled, there = (", ".join(c) for c in ([m.condition for m in sets.values()], population.conditions))
         problem = f"the recordings have the conditions {there}, and the run has models of {modelled} alone"
         raise DataError(f"Checking {data}: {problem}; name the condition, as in the study.")
-    rows = Rows()
-    with open_executor(workers) as executor:
+    rows = []
+    with open_executor(workers) as mapped:
         for name, models in known.items():
             outliers = OutlierModel.load(store.path("outliers", name))
             factors = EpisodeFactors.load(store.path("factors", quote(models.condition, safe="")))
             recorded = Recorded.of(factors, models, outliers.freqs_hz)
-            rows += score_condition(recorded, outliers, population, values, executor, same_unit)
+            rows += score_condition(recorded, outliers, population, values, mapped, same_unit)
     for row in rows:
         if beside := errors.get((row["unit"], row["condition"])):
             row["error"] = max(beside, key=itemgetter("ratio"))
@@ -124,7 +124,7 @@ def errors_beside_bounds(context: Context, population: Population, values: Value
             (size, along, apart), rms = parts[:, i], float(np.mean([outcome.errors[key][i]["rms"] for key in keys]))
             gain = float((abs(along) + np.sqrt(max(bound**2 - apart**2, 0.0))) / max(size, TINY))
             row = {"state": name, "rms": rms, "bound": bound, "ratio": rms / bound, "unit": population.channels[i].unit}
-            errors.setdefault(place, Rows()).append(row | {"gain_percent": 100 * gain})
+            errors.setdefault(place, []).append(row | {"gain_percent": 100 * gain})
     return errors
 
 
@@ -143,16 +143,16 @@ def score_condition(
     outliers: OutlierModel,
     population: Population,
     values: Values,
-    executor: Executor,
+    mapped: Mapped,
     same_unit: bool,
 ) -> Rows:
     """Score all units that were recorded in one condition."""
-    models, rows = recorded.models, Rows()
+    models, rows = recorded.models, []
     condition, halves = models.condition, recorded.halves()
     everything = {unit: keys for unit, c, keys in population.groups() if c == condition}
     tasks = [(population.select([u], [condition]), keys, models.lifting) for u, keys in everything.items()]
     motion = None if halves is None else outliers.motion_levels(*halves)
-    for (unit, keys), factor in zip(everything.items(), executor.map(reduce_episodes, tasks), strict=True):
+    for (unit, keys), factor in zip(everything.items(), mapped(reduce_episodes, tasks), strict=True):
         evidence = Evidence.of(factor, models, values[unit])
         known = recorded.same_recordings(factor)
         if unit in recorded.units and unit not in known and not same_unit:
@@ -172,11 +172,11 @@ def score_condition(
 
 def monitored(recordings: FieldRecordings) -> Rows:
     """Return a row for every unit and condition without recorded hidden channels: the monitor's level decides."""
-    population, observer, rows = recordings.population, recordings.observer, Rows()
+    population, observer, rows = recordings.population, recordings.observer, []
     missing = [name for name in observer.recorded if name not in population.states]
     monitor, units = observer.monitor, observer.monitor.units if observer.monitor else 0
     for unit, condition, keys in population.groups():
-        counts, judged, samples = Counter[str](), list[tuple[Array, Flags]](), 0  # innovations, and where they count
+        counts, judged, samples = Counter[str](), [], 0  # innovations, and where they count
         for arrived in map(recordings.arriving, keys):
             samples += len(arrived.y)
             counts.update(status_counts(screened(observer, arrived.y, arrived.u).status))

@@ -42,7 +42,7 @@ def run_demo(out: Path, settings: ByName, workers: int, progress: Progress, over
     data = {"source": str(out / _RECORDINGS), "reader": "parquet"}
     config = validate_config({"name": "demo", "data": data}, out, overrides=overrides)
     digest = digest_of(code_key(), settings)
-    with open_run(out, config) as store, open_executor(workers) as executor:
+    with open_run(out, config) as store, open_executor(workers) as mapped:
         if (artefact := store.stored(digest)) is not None:
             store.add(_STAGE, artefact)
         else:
@@ -52,4 +52,4 @@ def run_demo(out: Path, settings: ByName, workers: int, progress: Progress, over
                 simulate_to(draft.draft(_RECORDINGS), HARMONIC_DRIVE, "parquet", settings)
                 draft.commit(_STAGE, digest, time.perf_counter() - began)
         require_usable(config, Stage.REPORT)
-        return run_in(store, config, Stage.REPORT, Work(executor, progress))
+        return run_in(store, config, Stage.REPORT, Work(mapped, progress))

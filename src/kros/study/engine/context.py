@@ -149,7 +149,7 @@ def _outdate(context: Context, digests: Mapping[Stage, str]) -> None:
 
 def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, str]:
     """Return digests of what stages follow from: kros, the stages before, recordings, their part of the study."""
-    tables, digest, digests = context.config.dump(), code_key(), dict[Stage, str]()
+    tables, digest, digests = context.config.dump(), code_key(), {}
     tables |= {f"{section}.{key}": v for section, of in tables.items() if isinstance(of, dict) for key, v in of.items()}
     for step in steps:
         if step.wanted(context.config):
@@ -165,7 +165,7 @@ def inputs_digest(context: Context) -> str:
     if given is not None:
         declared = (given.columns, given.sample_period_s, given.units, sorted(given.metadata.items()))
         return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
-    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [source]
+    files = sorted(p for p in source.rglob("*") if p.is_file())
     return digest_of([(str(f), *stamp_of(f)) for f in files])
 
 

@@ -19,7 +19,7 @@ from functools import partial
 from threading import Lock
 from typing import Any
 
-from ...core import ConfigError, Executor, KrosError, MissingDependencyError, Progress, frozen
+from ...core import ConfigError, KrosError, Mapped, MissingDependencyError, Progress, frozen
 from ...core.arrays import T
 from ...core.linalg import pieces
 from .store import code_key
@@ -66,13 +66,13 @@ _GIVEN_UP = (
 
 
 @frozen
-class DaskExecutor(Executor):
-    """Runs tasks on a Dask cluster, in batches where they are many."""
+class DaskExecutor:
+    """Maps on a Dask cluster, in batches where tasks are many."""
 
     client: Any
     address: str
 
-    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+    def __call__(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Yield results in the order of the tasks, which run again elsewhere where a worker ends."""
         from distributed.client import ClosedClientError
 
@@ -110,7 +110,7 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
         raise KrosError(f"{worker}: its kros is not that of the study; install the same version on every worker.")
     with _ALONE, single_threaded(), threadpool_limits(1):
         try:
-            return [function(task) for task in tasks]
+            return _each(function, tasks)
         except FileNotFoundError as error:
             need = "recordings and run folder must be in a shared folder, the same path on every worker"
             raise KrosError(f"{worker}: finds no {error.filename}; {need}.") from error
@@ -159,17 +159,11 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
 _CHUNKS = 100  # of a map of many tasks, which are small: handing each out costs the parent a tenth of the work
 
 
-@frozen
-class ProcessExecutor(Executor):
-    """Runs tasks in worker processes, each with a single BLAS thread."""
-
-    pool: Any
-
-    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks, whose work begins at once."""
-        tasks = list(tasks)
-        chunks = [tasks[part] for part in pieces(len(tasks), max(1, len(tasks) // _CHUNKS))]
-        return _results(deque(self.pool.submit(_each, function, chunk) for chunk in chunks))
+def _in_processes(pool: Any, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+    """Map in worker processes, each with a single BLAS thread; work begins at once."""
+    tasks = list(tasks)
+    chunks = [tasks[part] for part in pieces(len(tasks), len(tasks) // _CHUNKS)]
+    return _results(deque(pool.submit(_each, function, chunk) for chunk in chunks))
 
 
 def _each(function: Callable[[Any], T], tasks: Sequence[Any]) -> list[T]:
@@ -197,18 +191,18 @@ def _results(futures: deque[Any]) -> Iterator[Any]:
 
 
 @contextmanager
-def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
-    """Open the executor that fits: Dask for a scheduler's address, processes for more than one worker."""
+def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Mapped]:
+    """Open what maps over tasks: Dask for a scheduler's address, processes for more than one worker."""
     if workers < 1:
         raise ConfigError(f"--workers {workers}: at least 1 is needed.")
     if scheduler is not None:
-        with open_dask(scheduler) as executor:
-            yield executor
+        with open_dask(scheduler) as mapped:
+            yield mapped
     elif workers == 1:
-        yield Executor()
+        yield map
     else:
         with single_threaded(), _pool(workers) as pool:
-            yield ProcessExecutor(pool)
+            yield partial(_in_processes, pool)
 
 
 @contextmanager

@@ -22,8 +22,8 @@ def run(context: Context) -> None:
 
 def render_run(folder: Path, workers: int) -> Path:
     """Write the report of a finished run again; `workers` processes draw its figures."""
-    with open_finished(folder, alone=True) as context, open_executor(workers) as executor:
-        return render(folder, context.store.metrics(), executor.map)
+    with open_finished(folder, alone=True) as context, open_executor(workers) as mapped:
+        return render(folder, context.store.metrics(), mapped)
 
 
 def write_figures(folder: Path, out: Path) -> list[str]:

@@ -61,9 +61,8 @@ def test_names_in_place_of_channels() -> None:
         population = kros.from_arrays(data, **NAMES)
         assert (population.states, population.inputs, population.measured) == (("x", "v"), ("u",), ("x",))
         np.testing.assert_array_equal(population.read(EpisodeKey("a", "default", "0")), values(0))
-    assert (
-        repr(population) == "Population(1 unit, 1 condition, 1 episode every 0.1 s; states x (measured), v; inputs u)"
-    )
+    rows = "units 1, episodes 1, conditions default, period 0.1 s, states x (1, measured), v (1), inputs u (1)"
+    assert repr(population) == f"<Population: {rows}>"
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_tab_separated_without_header(tmp_path: Path) -> None:
     assert population.sample_period_s == 0.01
     np.testing.assert_allclose(population.read(population.episodes[0]), values[:, 1:] * [1e-3, 1], rtol=1e-15)
     table["channel"] = [{**CHANNEL[0], "column": 4}, channel[1]]
-    with pytest.raises(DataError, match=r"a_1\.tsv: column 4 is missing, found .*; correct the mapping"):
+    with pytest.raises(DataError, match=r"a_1\.tsv: column 4 is missing; found .*; correct the mapping"):
         read_csv_folder(tmp_path, table)
 
 
@@ -100,7 +100,7 @@ def read_first(folder: Path, unit: str = "a") -> Population:
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        ("t,position,volt", r"cold_1\.csv: column 'pos' is missing, found \['t', 'position', 'volt'\]"),
+        ("t,position,volt", r"cold_1\.csv: column 'pos' is missing; found \['t', 'position', 'volt'\]"),
         ("t,pos,v", "column 'volt' is missing"),
         ("t,pos,pos", "column 'pos' occurs 2 times"),
         ("time,pos,volt", "column 't' is missing"),

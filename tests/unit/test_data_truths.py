@@ -31,7 +31,7 @@ def test_a_truth_is_no_channel() -> None:
     judged, plain = recorded(), recorded(CHANNELS)
     assert judged.channels == plain.channels == CHANNELS
     assert (judged.truths, judged.true_states) == ((TRUTH,), (1,))
-    assert repr(judged) == repr(plain)[:-1] + "; true v)"
+    assert repr(judged) == f"{repr(plain)[:-1]}, truths {TRUTH.label}>"
     for key in plain.episodes:
         np.testing.assert_array_equal(judged.read(key), plain.read(key))
     whole, same = EpisodeBatch.read(judged, judged.episodes, truths=True), EpisodeBatch.read(plain, plain.episodes)

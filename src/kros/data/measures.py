@@ -132,8 +132,8 @@ def _measured(text: str) -> Measure | None:
     registry, names = _registry()
     try:
         zero, one, two = (_in_base(registry, value, text) for value in (0, 1, 2))
-    except (AttributeError, ArithmeticError, AssertionError, LookupError, TypeError, ValueError):
-        return None  # the errors of pint for what it does not know
+    except Exception:
+        return None  # the errors of pint for what it does not know have no common base
     linear = math.isclose(two.magnitude - one.magnitude, one.magnitude - zero.magnitude, rel_tol=AGREED)
     if one.units not in names or not linear:
         return None

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, ByName, Columns, DataError, Names, Record, grouped, member
+from ..core import Array, ByName, Columns, DataError, Names, Record, frozen, grouped, member
 from .shown import Shown
 
 DEFAULT_CONDITION = "default"
@@ -146,7 +146,7 @@ def columns_in_order(channels: Iterable[Any]) -> tuple[Any, ...]:
     return tuple(sorted(channels, key=lambda c: list(Role).index(c.role)))
 
 
-@dataclass(frozen=True)
+@frozen
 class Split:
     """Training and test episodes, in natural order."""
 
@@ -191,15 +191,7 @@ class Population(Shown):
     episodes: Keys
     source: Any  # kros.data.prepare.PreparedSource
     metadata: ByName = field(default_factory=dict)
-    scaling: Mapping[str, Scaling] = field(default_factory=dict)
-
-    def __repr__(self) -> str:
-        counts = {"unit": len(self.units), "condition": len(self.conditions), "episode": len(self.episodes)}
-        sizes = ", ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items())
-        states = ", ".join(f"{s} (measured)" if s in self.measured else s for s in self.states)
-        true = f"; true {', '.join(t.of for t in self.truths)}" if self.truths else ""
-        channels = f"states {states}; inputs {', '.join(self.inputs) or 'none'}{true}"
-        return f"Population({sizes} every {self.sample_period_s:g} s; {channels})"
+    scaling: Scalings = field(default_factory=dict)
 
     def _summary_rows(self) -> Record:
         rows = {f"{role.value}s": ", ".join(c.label for c in self.columns if c.role is role) for role in Role}
@@ -255,8 +247,6 @@ class Population(Shown):
 
     def keys(self, unit: str | None = None, condition: str | None = None) -> Keys:
         """Return the episodes of a unit, a condition or both."""
-        if unit is not None and condition is not None:
-            return tuple(self.episodes[i] for i in self._positions.get((unit, condition), ()))
         return tuple(e for e in self.episodes if unit in (None, e.unit) and condition in (None, e.condition))
 
     def read(self, key: EpisodeKey) -> Array:
@@ -266,8 +256,7 @@ class Population(Shown):
     def read_with_truths(self, key: EpisodeKey) -> tuple[Array, Array]:
         """Read one episode, shape (n_samples, n_channels), and what its states really were, (n_samples, n_truths)."""
         values, n = self.source(key), len(self.channels)
-        channels = np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values
-        return channels, values[:, n : n + len(self.truths)]
+        return np.ascontiguousarray(values[:, :n]), values[:, n:]
 
     def read_parts(self, key: EpisodeKey) -> tuple[Array, Array]:
         """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""

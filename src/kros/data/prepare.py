@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields, replace
 
-import numpy as np
 from pydantic import ValidationError
 
 from ..core import Array, ByName, ConfigError, DataError, frozen, shortened, united
@@ -125,9 +124,9 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     return replace(population, columns=columns, sample_period_s=period, scaling=scaling, source=source)
 
 
-def parse_steps(tables: Iterable[Step | ByName], where: str = "data.prepare") -> tuple[Step, ...]:
+def parse_steps(tables: Iterable[Step | ByName]) -> tuple[Step, ...]:
     """Return steps from TOML tables such as ``{"step": "trim", "start": 1000}``; steps pass through."""
-    return tuple(t if isinstance(t, Step) else _parse_step(t, f"{where}[{i}]") for i, t in enumerate(tables))
+    return tuple(t if isinstance(t, Step) else _parse_step(t, f"data.prepare[{i}]") for i, t in enumerate(tables))
 
 
 def _parse_step(table: ByName, where: str) -> Step:
@@ -152,13 +151,13 @@ class _Divide(Step):
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording in the sizes."""
-        return replace(recording, values=recording.values / np.array(self.sizes))
+        return replace(recording, values=recording.values / self.sizes)
 
 
 def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
     """Return the population with channels, and their truths, divided by sizes; their units are then unknown."""
     owners = [c.of or c.name for c in population.columns]
+    source = population.source
     divided = _Divide(tuple(float(sizes.get(name, 1.0)) for name in owners))
-    source = replace(population.source, steps=(*population.source.steps, divided))
     columns = (replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True))
-    return replace(population, source=source, columns=tuple(columns))
+    return replace(population, source=replace(source, steps=(*source.steps, divided)), columns=tuple(columns))

@@ -191,13 +191,9 @@ def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], g
 
 
 def is_constant(column: Array) -> bool:
-    """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
-    first = column[0]
-    if not np.isfinite(first):
-        return False
-    room = CHECK.constant * abs(first)
-    lower, upper = first - room, first + room
-    return bool(lower <= column[len(column) // 2] <= upper and np.all((column >= lower) & (column <= upper)))
+    """Tell whether a signal never changes, but for rounding."""
+    first, room = column[0], CHECK.constant * abs(column[0])
+    return bool(np.isfinite(first) and np.all((column >= first - room) & (column <= first + room)))
 
 
 def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int) -> None:

@@ -6,11 +6,13 @@ from html import escape
 from importlib import import_module
 from typing import Any
 
+from ..core import Record
+
 
 class Shown:
     """What all results of the short way can do: say in a few lines what they are, and draw themselves."""
 
-    def _summary_rows(self) -> dict[str, Any]:
+    def _summary_rows(self) -> Record:
         """Return the rows of the summary by name; those of None, or of an empty text, are left out."""
         raise NotImplementedError
 

@@ -24,12 +24,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from pydantic import ConfigDict
 
-from ..core import Array, ConfigError, DataError, Names, did_you_mean, limits
+from ..core import Array, ConfigError, DataError, Names, did_you_mean, frozen, limits
 from .population import Channel, Channels, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 
@@ -39,7 +39,7 @@ GAP = 10.0  # median steps of time that a straight line bridges
 PASSBAND = 0.8  # of a filter that makes the rate fall, as a share of the new Nyquist frequency
 
 
-@dataclass(frozen=True)
+@frozen
 class Signals:
     """The signals of all episodes before or after a step."""
 
@@ -68,9 +68,8 @@ class Step:
     'x'
     """
 
-    step: ClassVar[str] = ""
-    makes_even: ClassVar[bool] = False
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    step, makes_even = "", False
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
     @property
     def named(self) -> Names:
@@ -99,7 +98,7 @@ class Step:
         known = [c.name for c in channels]
         unknown = next((name for name in names if name not in known), None)
         if unknown is not None:
-            hint = did_you_mean(unknown, known) or ";"
+            hint = did_you_mean(unknown, known)
             raise ConfigError(f"Step {self.step!r} asks for channel {unknown!r}{hint} there are {known}; correct it.")
         return [known.index(name) for name in names]
 
@@ -116,7 +115,7 @@ class Scale(Step):
     factor: float
     unit: str | None = None
     offset: float = 0.0
-    step: ClassVar[str] = "scale"
+    step = "scale"
 
     def describe(self, signals: Signals) -> Signals:
         """Return the signals with channels multiplied and their new unit of measure."""
@@ -148,7 +147,7 @@ class Shift(Step):
 
     channels: Names
     lag: int
-    step: ClassVar[str] = "shift"
+    step = "shift"
 
     def describe(self, signals: Signals) -> Signals:
         """Return the signals with channels moved."""
@@ -178,7 +177,7 @@ class Offset(Step):
     reference: str
     start: int
     stop: int
-    step: ClassVar[str] = "offset"
+    step = "offset"
 
     def describe(self, signals: Signals) -> Signals:
         """Return the signals with the offset in words."""
@@ -208,7 +207,7 @@ class Trim(Step):
     start: int = 0
     stop: int | None = None
     tail: int = 0
-    step: ClassVar[str] = "trim"
+    step = "trim"
 
     def describe(self, signals: Signals) -> Signals:
         """Refuse bounds in the wrong order."""
@@ -244,8 +243,8 @@ class Resample(Step):
 
     period_s: float
     max_gap_s: float | None = None
-    step: ClassVar[str] = "resample"
-    makes_even: ClassVar[bool] = True
+    step = "resample"
+    makes_even = True
 
     def describe(self, signals: Signals) -> Signals:
         """Return the signals at the new sampling period."""
@@ -288,7 +287,7 @@ class Differentiate(Step):
     cutoff_hz: float
     unit: str = ""
     of: str = ""
-    step: ClassVar[str] = "differentiate"
+    step = "differentiate"
 
     def describe(self, signals: Signals) -> Signals:
         """Return the signals with the new channel after those alike; it has the factor of its channel."""

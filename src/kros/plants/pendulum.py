@@ -31,7 +31,7 @@ class PendulumTruth(UnitTruth):
         return np.stack([x[1], -a * np.sin(x[0]) - b * x[1] + g * u])
 
 
-class PendulumPopulation(Batch[PendulumTruth]):
+class PendulumPopulation(Batch):
     """Settings of a simulated batch of pendulums, see `BatchSettings`; a spread of 1 means deviations of 8 to 15 %.
 
     The outlier has a stiff joint.
@@ -39,8 +39,14 @@ class PendulumPopulation(Batch[PendulumTruth]):
     Examples
     --------
     >>> from kros.plants import PendulumPopulation
-    >>> PendulumPopulation(n_units=2, n_episodes=1, seconds=1.0, seed=3).simulate().population
-    Population(2 units, 1 condition, 2 episodes every 0.01 s; states position (measured), velocity; inputs torque)
+    >>> print(PendulumPopulation(n_units=2, n_episodes=1, seconds=1.0, seed=3).simulate().population.summary())
+    Population
+    units       2
+    episodes    2
+    conditions  default
+    period      0.01 s
+    states      position (rad, measured), velocity (rad/s)
+    inputs      torque (1)
     """
 
     plant, truth = PendulumTruth.plant, PendulumTruth

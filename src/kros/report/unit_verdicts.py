@@ -40,9 +40,6 @@ class Check(Shown):
 
     rows: Rows
 
-    def __repr__(self) -> str:
-        return f"<Check: {', '.join(f'{unit} {verdict}' for unit, (verdict, _) in by_unit(self.rows).items())}>"
-
     def _summary_rows(self) -> Record:
         return {unit: f"{verdict}, {'; '.join(reasons)}" for unit, (verdict, reasons) in by_unit(self.rows).items()}
 

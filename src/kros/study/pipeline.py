@@ -51,10 +51,6 @@ class RunResult(Shown):
     folder: Path
     metrics: Record
 
-    def __repr__(self) -> str:
-        study = self.metrics["study"]
-        return f"<RunResult {self.folder}: {study['units']} units, deployed is {study.get('deployed')}>"
-
     def _summary_rows(self) -> Record:
         facts, report = Facts(self.metrics), self.folder / "report.html"
         place = {"report": report} if report.exists() else {"results": self.folder}
@@ -141,8 +137,8 @@ def run(
     config = study_of(source, out, sections)
     require_own(out, config)
     require_usable(config, until, given)
-    with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
-        return run_in(store, config, until, Work(executor, progress or Progress()), given)
+    with open_run(out, config) as store, open_executor(workers, scheduler) as mapped:
+        return run_in(store, config, until, Work(mapped, progress or Progress()), given)
 
 
 def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: ByName) -> StudyConfig:

@@ -8,12 +8,11 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ...core import DataError, Names
+from ...core import DataError, Names, frozen
 from ..measures import is_unit_row
 from ..readers.formats import is_binary, texts_of
 from ..readers.tables import ABSENT, ORDERS, Dialect, Table, cells_of, head_of, lines_of, microseconds
@@ -26,7 +25,7 @@ _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
 _NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
 
 
-@dataclass(frozen=True)
+@frozen
 class TableHead(Table):
     """A table with the cells of its first rows of numbers."""
 

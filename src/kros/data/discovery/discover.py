@@ -107,7 +107,7 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Table], Texts]:
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
     usual = (h for h in heads if (h.dialect, h.fields) == commonest)
     head = max(usual, key=lambda h: sum(map(h.is_numeric, range(len(h.fields)))))  # a sensor may have been off
-    alike, strange = dict[str, Table](), Texts()
+    alike, strange = {}, {}
     for relative, path in files.items():
         try:
             table = Table.open(path, head.dialect, head.fields)
@@ -129,7 +129,7 @@ def _columns(
     columns = describe(head)
     numeric = [c for c in columns if head.is_numeric(c.at)]
     table, samples = _sampled(source, tables, numeric)
-    candidates, labels = time_columns(numeric, samples), Texts()
+    candidates, labels = time_columns(numeric, samples), {}
     if period_s is None and not candidates:
         labels = label_columns(table)  # of several episodes in a file
     if labels:
@@ -201,7 +201,7 @@ def _channel(column: TableColumn) -> Record:
 
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
     """Return the columns with measured states and inputs as named, where any are named, else as proposed."""
-    measured, given, decided = ColumnPart.MEASURED, ColumnPart.INPUT, list[TableColumn]()
+    measured, given, decided = ColumnPart.MEASURED, ColumnPart.INPUT, []
     freed = {measured: ColumnPart.STATE, given: ColumnPart.LEFT_OUT}
     named = {
         measured: [_named(columns, n) for n in wanted.measured],
@@ -236,7 +236,7 @@ def _named(columns: Sequence[TableColumn], name: str) -> TableColumn:
     free = [c for c in columns if c.part is not ColumnPart.TIME]
     for column in (*(c for c in free if c.name == name), *(c for c in free if c.header == name)):
         return column
-    hint = did_you_mean(name, [c.name for c in free]) or ";"
+    hint = did_you_mean(name, [c.name for c in free])
     raise ConfigError(f"Roles: there is no column {name!r}{hint} beside time there are {_names(free)}.")
 
 

@@ -67,7 +67,7 @@ def _counts(words: Sequence[str]) -> bool:
 
 
 def _cut(stems: Sequence[str]) -> Cut | None:
-    """Cut into words, where some paths have more into what all begin with and as many at the end as all have.
+    """Cut into words, where some paths have more into as many at the end as all have, and what is before them.
 
     A number with a decimal point, or a version, stays whole.
     """
@@ -76,11 +76,8 @@ def _cut(stems: Sequence[str]) -> Cut | None:
         parts = [re.split(marks, s) for s in stems]
         if len(set(map(len, parts))) == 1:
             return parts
-    fewest, head = min(map(len, parts)), 0
-    while head + 1 < fewest and len({tuple(p[head : head + 2]) for p in parts}) == 1:
-        head += 2
-    tail = fewest - head - 1
-    return [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts] if tail > 0 else None
+    tail = min(map(len, parts)) - 1
+    return [["".join(p[:-tail]), *p[-tail:]] for p in parts] if tail > 0 else None
 
 
 def _roles(columns: list[Names], folders: int) -> tuple[Roles, bool]:

@@ -9,6 +9,7 @@ from enum import Enum
 import numpy as np
 
 from ...core import Array, frozen
+from ...core.arrays import Texts
 from ..measures import ZERO_OF_CELSIUS, Measure, clean_unit, identifier, kind_of, measure, split_header, words_of
 from ..readers.parquet import KEYS
 from ..readers.tables import Table, stretches
@@ -108,7 +109,7 @@ def time_scale(step: float) -> tuple[float, str]:
 
 def propose(columns: Sequence[TableColumn], samples: Samples) -> list[TableColumn]:
     """Return the columns, without that of time, with the part that each is likely to have."""
-    proposed = list[TableColumn]()
+    proposed = []
     for column in columns:
         spare = _spare(column, samples[column.at])
         part, why = (ColumnPart.LEFT_OUT, spare) if spare else _by_name(column)
@@ -142,9 +143,9 @@ def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
     return ColumnPart.LEFT_OUT, UNKNOWN
 
 
-def label_columns(table: Table) -> dict[str, str]:
+def label_columns(table: Table) -> Texts:
     """Return the columns whose names and values, which change now and then in a file, say that they label rows."""
-    labels = dict[str, str]()
+    labels = Texts()
     for field in table.fields:
         words = set(identifier(f"{field} ").lower().split("_"))
         named = (role for role, known in LABELS.items() if set() < words - NUMBERS <= set(known.split()))

@@ -92,7 +92,7 @@ def from_arrays(
     >>> episode = {"angle": angle, "rate": rate, "torque": torque}
     >>> names = {"states": ["angle", "rate"], "inputs": ["torque"], "measured": ["angle"]}
     >>> from_arrays({"a": [episode]}, sample_period_s=0.01, **names)
-    Population(1 unit, 1 condition, 1 episode every 0.01 s; states angle (measured), rate; inputs torque)
+    <Population: units 1, episodes 1, conditions default, period 0.01 s, states angle (1, measured), rate (1), ...>
     """
     check_period(sample_period_s, "from_arrays")
     declared = declare_channels(channels, states, inputs, measured, "from_arrays")
@@ -180,7 +180,7 @@ def from_frame(
     >>> import kros
     >>> frame = pd.DataFrame({"unit": ["a"] * 50 + ["b"] * 50, "x": np.arange(100) / 10, "u": np.cos(np.arange(100))})
     >>> kros.from_frame(frame, states=["x"], inputs=["u"], measured=["x"], sample_period_s=0.01)
-    Population(2 units, 1 condition, 2 episodes every 0.01 s; states x (measured); inputs u)
+    <Population: units 2, episodes 2, conditions default, period 0.01 s, states x (1, measured), inputs u (1)>
     """
     if type(frame).__module__.partition(".")[0] != "pandas" or not hasattr(frame, "columns"):
         raise DataError(f"from_frame needs a pandas DataFrame, found {type(frame).__name__}; use from_arrays.")
@@ -189,7 +189,7 @@ def from_frame(
     ordered, known = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame")), list(frame)
     for name in filter(None, (*(c.name for c in ordered), time, unit)):
         if (count := known.count(name)) != 1:
-            problem = f"occurs {count} times;" if count else f"is missing{did_you_mean(name, known) or ';'}"
+            problem = f"occurs {count} times;" if count else f"is missing{did_you_mean(name, known)}"
             raise DataError(f"from_frame: column {name!r} {problem} the columns are {known}; correct the name.")
     numbers = np.column_stack([_column(frame, c.name) for c in ordered])
     times = None if time is None else _column(frame, time)

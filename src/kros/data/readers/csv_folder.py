@@ -7,7 +7,6 @@ import logging
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -158,19 +157,17 @@ def _is_mark(text: str) -> bool:
 
 def load_mapping(mapping: CsvMapping | ByName | Path | str) -> CsvMapping:
     """Return a mapping from a TOML file or a table with the same keys."""
-    if isinstance(mapping, CsvMapping):
-        return mapping
-    if isinstance(mapping, Mapping):
+    if isinstance(mapping, CsvMapping | Mapping):
         return CsvMapping.of(mapping, "CSV mapping")
     return CsvMapping.of(read_toml(Path(mapping), "CSV mapping"), f"CSV mapping {mapping}")
 
 
 log = logging.getLogger(__name__)
 _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
-ENDINGS = (*[".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz"], *FORMATS)
+ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", *FORMATS)
 
 
-@dataclass(frozen=True)
+@frozen
 class FilePlace:
     """Where an episode is: a table, the columns that are wanted (time first), rows of it, and which piece of these."""
 
@@ -207,13 +204,13 @@ class CsvRecordings(Recordings):
 
 
 def read_csv_folder(
-    source: Path | str,
+    source: Path,
     mapping: CsvMapping | ByName | Path | str,
     optional: Collection[str] = (),
     damaged: Texts | None = None,
 ) -> Population:
     """Read a folder of CSV files; those that cannot be used are collected in `damaged`, with the reason, or refused."""
-    chosen, source = load_mapping(mapping), Path(source)
+    chosen = load_mapping(mapping)
     dialect = Dialect(**chosen.model_dump(include=set(Dialect.model_fields)))
     places = dict[EpisodeKey, FilePlace]()
     groups, units_of_measure = Texts(), dict[Column, str]()
@@ -275,7 +272,7 @@ def _present(mapping: CsvMapping, fields: Names, optional: Collection[str]) -> C
 
 def csv_files(source: Path) -> dict[str, Path]:
     """Return the tables below a folder by their relative paths, in order."""
-    files = dict[str, Path]()
+    files = {}
     for folder, folders, names in os.walk(source):
         folders[:] = sorted(f for f in folders if not f.startswith("."))
         for name in sorted(names):
@@ -287,7 +284,7 @@ def csv_files(source: Path) -> dict[str, Path]:
 
 def _matches(source: Path, mapping: CsvMapping) -> list[tuple[Path, re.Match[str]]]:
     """Return the files that the mapping describes; the others are counted and named."""
-    files, matches, others = csv_files(source), list[tuple[Path, re.Match[str]]](), list[str]()
+    files, matches, others = csv_files(source), [], []
     for relative, path in files.items():
         if mapping.exclude and re.search(mapping.exclude, relative):
             continue
@@ -351,6 +348,6 @@ def _position(table: Table, column: Column, unit: str = "") -> int:
     places = _named(table.fields, column, unit)
     if len(places) == 1:
         return places[0]
-    problem = f"occurs {len(places)} times," if places else f"is missing{did_you_mean(column, table.fields) or ','}"
+    problem = f"occurs {len(places)} times," if places else f"is missing{did_you_mean(column, table.fields)}"
     found = f"found {list(table.fields)}; correct the mapping or the file"
     raise DataError(f"Reading {table.path}: column {column!r} {problem} {found}.")

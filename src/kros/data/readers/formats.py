@@ -36,7 +36,7 @@ def _hdf5(path: Path) -> Iterator[Group]:
     """HDF5; a unit of measure is the attribute `units` or `unit` of a data set."""
     import h5py
 
-    content, units = Record(), Texts()
+    content, units = {}, {}
 
     def visit(place: str, item: Any) -> None:
         name, unit = place.replace("/", "."), item.attrs.get("units", item.attrs.get("unit", ""))

@@ -54,8 +54,8 @@ MAPPING = CsvMapping(
     metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
 )
 
-HEADER = ["time_s", "position_deg", "velocity_deg_per_s", "torque_percent"]
-HEADER += ["target_position_deg", "target_velocity_deg_per_s"]
+HEADER = ["time_s", "position_deg", "velocity_deg_per_s", "torque_percent", "target_position_deg"]
+HEADER.append("target_velocity_deg_per_s")
 
 
 def find_root(source: Path) -> Path | None:
@@ -71,9 +71,9 @@ def is_raw_layout(source: Path) -> bool:
     return any(path.is_dir() and re.fullmatch(FOLDER, path.name) for path in folders)
 
 
-def read_motor_drive_raw(source: Path | str) -> Population:
+def read_motor_drive_raw(source: Path) -> Population:
     """Read the paper's raw layout, sampled at 1 kHz, so steps of time of 1 are ms and of 1000 are us."""
-    root, what = find_root(Path(source)), f"Reading {source} as motor-drive-raw"
+    root, what = find_root(source), f"Reading {source} as motor-drive-raw"
     if root is None:
         raise DataError(f"{what}: found no folder 'population' or 'outliers'; set another data.reader.")
     files = [name for name in csv_files(root) if name.endswith(".csv") and name.startswith(GROUPS)]
@@ -88,12 +88,12 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     return prepare(population, STEPS)
 
 
-def write_raw(population: Population, out: Path | str) -> None:
+def write_raw(population: Population, out: Path) -> None:
     """Write recordings before preparation, in the channels and units of the reader, as a whole folder or none."""
     import pyarrow as pa
     from pyarrow import csv
 
-    with whole_folder(Path(out)) as folder:
+    with whole_folder(out) as folder:
         for unit, condition, keys in population.groups():
             group = OUTLIERS if population.unit(unit).group == OUTLIERS else "population"
             name = f"{STAMP}_{unit}_{condition}"

@@ -71,10 +71,10 @@ def read(
     ...     kros.read(folder).unit_ids
     ('001', '002')
     """
-    steps = parse_steps(prepare)
+    steps, source = parse_steps(prepare), Path(source)
     if reader is not None and reader not in READERS:
         raise ConfigError(f"data.reader should be one of {', '.join(READERS)}, found {reader!r}; correct it.")
-    chosen = _fitting(reader, Path(source), mapping is not None)
+    chosen = _fitting(reader, source, mapping is not None)
     if chosen == "csv" and mapping is None:
         raise ConfigError(f"Reading {source} as csv needs a mapping; give mapping=, or [data.csv] by kros init.")
     if chosen != "csv" and mapping is not None:

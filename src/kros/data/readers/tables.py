@@ -9,7 +9,6 @@ import re
 import zlib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from ...core import AnyArray, Array, DataError, Names, Settings, limits
+from ...core import AnyArray, Array, DataError, Names, Settings, frozen, limits
 from ...core.files import pass_on_shortage, require_regular, shortened
 from ..measures import clean_unit, is_unit_row, split_header
 from .formats import columns_of, is_binary, texts_of, values_of
@@ -42,7 +41,7 @@ class Dialect(Settings):
     encoding: str = Field("utf-8", description="of the text, for example cp1252 or utf-16")
 
 
-@dataclass(frozen=True)
+@frozen
 class Table:
     """A table in a file."""
 
@@ -103,7 +102,7 @@ class Table:
                     yield [batch.column(names[i]) for i in wanted]
         except DataError:
             raise
-        except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
+        except Exception as error:
             raise self._error(error) from error
 
     def _error(self, error: Exception) -> DataError:

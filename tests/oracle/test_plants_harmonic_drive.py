@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.dynamics import GAINS, VELOCITY_POLE, DriveParameters, Loop, Physics, simulate
+from kros.plants.harmonic_drive.dynamics import GAINS, VELOCITY_POLE, DriveParameters, Physics, simulate
 from kros.plants.harmonic_drive.population import MAX_SPEED
 
 PERIOD = 1e-3
@@ -151,7 +151,7 @@ def test_energy_is_kept_without_friction_and_drive():
         assert np.all(np.abs(energy() / start - 1) < 2e-3)
 
 
-@pytest.mark.parametrize("loop", list(Loop))
+@pytest.mark.parametrize("loop", list(GAINS))
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_at_constant_speed_current_is_friction_and_the_position_error_vanishes(loop, direction):
     p = drives_of(9, 5)

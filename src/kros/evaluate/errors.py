@@ -11,8 +11,6 @@ import numpy as np
 
 from ..core import Array, Whole
 
-_SEGMENT = 512  # samples of a Welch segment, as in the paper
-
 
 def errors_of(
     estimate: Array, truth: Array, lengths: Whole, dt: float, band_hz: tuple[float, float] | None = None
@@ -26,13 +24,11 @@ def errors_of(
     known = {"rms": rms, "error_percent": _percent(rms, largest(truth, lengths))}
     if band_hz is not None:
         known["gearbox_band_power"] = power = np.empty_like(rms)
-        for length in np.unique(lengths):
-            rows = lengths == length
+        for i, length in enumerate(lengths):
             with np.errstate(over="ignore", invalid="ignore"):
-                error = np.ascontiguousarray(np.moveaxis((estimate - truth)[:length, rows], 0, -1))
-                freqs_hz, density = error_spectrum(error, dt, axis=-1)
+                freqs_hz, density = error_spectrum(estimate[:length, i] - truth[:length, i], dt)
                 inside = (freqs_hz >= band_hz[0]) & (freqs_hz <= band_hz[1])
-                power[rows] = density[..., inside].sum(axis=-1) * freqs_hz[1]
+                power[i] = density[inside].sum(axis=0) * freqs_hz[1]
     return known
 
 
@@ -67,13 +63,14 @@ def _percent(rms: Array, largest: Array) -> Array:
     return np.divide(100 * rms, largest, out=np.full_like(rms, np.nan), where=largest > 0)
 
 
-def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int = 0) -> tuple[Array, Array]:
-    """Return frequencies and one-sided power density of an error by Welch's method: half overlapping Hann windows."""
+def error_spectrum(error: Array, dt: float, segment: int = 512) -> tuple[Array, Array]:
+    """Return frequencies and one-sided power density of an error by Welch's method: half overlapping Hann windows.
+
+    Their length in samples is that of the paper.
+    """
     from scipy.signal import welch
 
-    values = np.asarray(error, dtype=float)
-    freqs_hz, density = welch(values, 1 / dt, nperseg=min(segment, values.shape[axis]), nfft=segment, axis=axis)
-    return np.asarray(freqs_hz), np.asarray(density)
+    return welch(error, 1 / dt, nperseg=min(segment, len(error)), nfft=segment, axis=0)
 
 
 def true_errors(signals: Array, truths: Array, lengths: Whole, dt: float) -> dict[str, Array]:
@@ -81,10 +78,7 @@ def true_errors(signals: Array, truths: Array, lengths: Whole, dt: float) -> dic
 
     Keys are those of the metrics, values have the shape (batch, n); NaN is unknown.
     """
-    lag = np.empty(truths.shape[1:])
-    for length in np.unique(lengths):
-        rows = lengths == length
-        lag[rows] = delay_samples(signals[:length, rows], truths[:length, rows])
+    lag = np.array([delay_samples(signals[:n, i], truths[:n, i]) for i, n in enumerate(lengths)])
     errors = errors_of(signals, truths, lengths, dt)
     return {f"true_{name}": values for name, values in errors.items()} | {"true_lag_s": lag * dt}
 

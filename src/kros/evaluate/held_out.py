@@ -10,6 +10,7 @@ import numpy as np
 from ..core import Array, ByName, Columns, Record, frozen, grouped
 from ..core.linalg import pieces
 from ..data import EpisodeBatch, EpisodeKey, Population
+from ..data.population import Keys
 from ..identify import ModelSet, free_run
 from ..observer import Observer, Sensors
 from ..observer.simulate import run_observers
@@ -42,9 +43,9 @@ class HeldOut:
     """Held-out episodes as the sensor shows them, with lifting parameters by unit; `shown` are displayed."""
 
     population: Population
-    keys: tuple[EpisodeKey, ...]
+    keys: Keys
     parameters: Mapping[str, dict[str, float]]
-    shown: tuple[EpisodeKey, ...] = ()
+    shown: Keys = ()
     sensor: Sensors = field(default_factory=dict)
     band_hz: tuple[float, float] | None = None  # in which the power of errors is known as well
 
@@ -77,7 +78,7 @@ class HeldOut:
 
     def outcomes(self, run: Callable[[EpisodeBatch], Iterable[Array]], truths: bool = True) -> list[Outcome]:
         """Return the outcomes of estimates, (n_samples, batch, n or more) each, some episodes after others."""
-        outcomes, n = list[Outcome](), len(self.population.states)
+        outcomes, n = [], len(self.population.states)
         for part in pieces(len(self.keys) or 1, SIDE_BY_SIDE):  # none at all are refused where they are read
             batch = self.read(self.keys[part], truths)
             shown = [(i, key) for i, key in enumerate(batch.keys) if key in self.shown]
@@ -114,7 +115,7 @@ class HeldOut:
 
     def rows(self, name: str, outcome: Outcome, roles: Mapping[str, str]) -> list[Record]:
         """Return a row for every unit, condition and estimated channel: means over the unit's episodes."""
-        columns, rows = outcome.estimated, list[Record]()
+        columns, rows = outcome.estimated, []
         for (unit, condition), keys in self.groups.items() if outcome.errors else ():
             about = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition}
             for j, channel in enumerate(self.population.states):

@@ -54,7 +54,7 @@ def known_load(
         acceleration = np.zeros_like(position)
         acceleration[1:-1] = np.diff(position, n=2, axis=0) / sample_period_s**2
         load = load + inertia * low_passed(acceleration, corner_hz, sample_period_s)
-    return np.asarray(load, dtype=float)
+    return load
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -27,11 +27,8 @@ _LIMITS: dict[str, tuple[float, float]] = {
 }
 
 
-T = TypeVar("T")  # true parameters, with `as_dict`, ready for JSON
-
-
 @frozen
-class SimulatedPopulation(Generic[T]):
+class SimulatedPopulation:
     """Recordings and what is true about them.
 
     Examples
@@ -44,7 +41,7 @@ class SimulatedPopulation(Generic[T]):
 
     population: Population  # ready for identification, as a reader yields it
     raw: Population  # as recorded, before preparation; the same where a plant needs none
-    truth: T  # with ``as_dict()``
+    truth: Any  # true parameters, with ``as_dict()``, ready for JSON
 
 
 class SimulatedEpisodes(Recordings):
@@ -68,8 +65,8 @@ class BatchSettings:
     outlier_severity: float = 1.0
 
     plant: ClassVar[str]
-    least_seconds: ClassVar[float] = 1.0
-    serial: ClassVar[tuple[int, int]] = (1, 3)  # of the first unit, and its digits
+    least_seconds = 1.0
+    serial = (1, 3)  # of the first unit, and its digits
     outlier_stream: ClassVar[tuple[int, ...]] = (OUTLIER_STREAM,)
     parameters: ClassVar[Mapping[str, tuple[float, float]]]  # nominal value, deviation of its logarithm at spread 1
     outlier_log_factors: ClassVar[Mapping[str, float]]  # on each parameter at severity s: exp(s value)
@@ -143,13 +140,10 @@ def by_unit(units: Sequence[str], parameters: Any) -> dict[str, Record]:
     return {unit: {name: getattr(parameters, name)[i].tolist() for name in names} for i, unit in enumerate(units)}
 
 
-P = TypeVar("P", bound=UnitTruth)
-
-
-class Batch(BatchSettings, ABC, Generic[P]):
+class Batch(BatchSettings, ABC):
     """A batch of small plants with one pseudorandom input; the first state is seen by an encoder."""
 
-    truth: Callable[..., P]  # of the units: names, then arrays by name
+    truth: Callable[..., UnitTruth]  # of the units: names, then arrays by name
     channels: ClassVar[Channels]
     truths: ClassVar[Channels] = ()
     noise: ClassVar[tuple[float, ...]]  # standard deviations of the sensors behind the encoder
@@ -158,7 +152,7 @@ class Batch(BatchSettings, ABC, Generic[P]):
     def reference(self, rng: np.random.Generator, n_samples: int) -> Array:
         """Draw the input of an episode, shape (n_samples,)."""
 
-    def simulate(self) -> SimulatedPopulation[P]:
+    def simulate(self) -> SimulatedPopulation:
         """Simulate all episodes of all units."""
         units, values = self.units()
         truth = self.truth(tuple(u.id for u in units), **values)
@@ -167,7 +161,7 @@ class Batch(BatchSettings, ABC, Generic[P]):
         states, names = truth.respond(inputs), [c.name for c in self.channels]
         true = states[[names.index(t.of) for t in self.truths]]
         states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
-        parts = dict[EpisodeKey, tuple[Array, Array, Array]]()
+        parts = {}
         for u, e in np.ndindex(len(units), self.n_episodes):
             noise = self.random(NOISE_STREAM, int(units[u].id), e).standard_normal((len(self.noise), n_samples))
             states[1 : 1 + len(noise), u, e] += np.array(self.noise)[:, None] * noise

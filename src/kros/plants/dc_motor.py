@@ -48,7 +48,7 @@ class DcMotorTruth(UnitTruth):
         return x
 
 
-class DcMotorPopulation(Batch[DcMotorTruth]):
+class DcMotorPopulation(Batch):
     """Settings of a simulated batch of DC motors, see `BatchSettings`; a spread of 1 means deviations of 5 to 15 %.
 
     The outlier has a tired magnet and a dry bearing.

@@ -75,6 +75,6 @@ class Controller(Settings):
         """Return what the recorded value of every named signal is in all that are known, (known, names)."""
         for name in names:
             if name not in known:
-                hint = did_you_mean(name, known) or ";"
+                hint = did_you_mean(name, known)
                 raise ConfigError(f"Controller: signal {name!r} is unknown{hint} there are {', '.join(known)}.")
         return np.eye(len(known))[:, [known.index(name) for name in names]] * recorded_factors(observer, names)

@@ -80,7 +80,7 @@ class Blocks:
             _, (d,), (gain,) = self.at(middle)
             if gain > 1:
                 return middle
-            ends = crossings(replace(s, B=s.B / d[w], C=s.C * d[z, None], D=s.D * d[z, None] / d[w]), 1.0)
+            ends = crossings(s.multiplied(d[z], 1 / d[w]), 1.0)
             low, high = ends[ends <= middle].max(initial=0.0), ends[ends > middle].min(initial=np.inf)
             arcs += [arc for arc in ((a, low), (high, b)) if arc[1] > arc[0] * (1 + ITERATED)]
         return None

@@ -26,7 +26,6 @@ from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -70,13 +69,6 @@ OUTLIER_LOG_FACTORS = {
 }
 
 
-class Loop(str, Enum):
-    """How stiff the velocity loop is."""
-
-    STIFF = "stiff"
-    SOFT = "soft"
-
-
 @dataclass(frozen=True)
 class Gains:
     """Controller gains."""
@@ -87,9 +79,9 @@ class Gains:
     antiwindup: float = 0.05  # share of the excess over the current limit that is taken off the integrator each sample
 
 
-GAINS = {
-    Loop.STIFF: Gains(position=25.0, velocity=3.75, integral=110.0),
-    Loop.SOFT: Gains(position=15.0, velocity=1.5, integral=25.0),
+GAINS = {  # of a stiff and of a soft velocity loop
+    "stiff": Gains(position=25.0, velocity=3.75, integral=110.0),
+    "soft": Gains(position=15.0, velocity=1.5, integral=25.0),
 }
 
 

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from ...core import AnyArray, Array, ConfigError, Flags, Names, Record, frozen, member
+from ...core import AnyArray, Array, ConfigError, Flags, Names, Record, frozen
 from ...data import Channel, EpisodeKey, Role, prepare
 from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
@@ -30,7 +29,6 @@ from .dynamics import (
     SAMPLE_PERIOD_S,
     DriveParameters,
     Gains,
-    Loop,
     simulate,
 )
 
@@ -132,7 +130,7 @@ class Truth:
 
     unit_ids: Names  # order of the unit axis
     parameters: DriveParameters
-    loop: Loop
+    loop: str
     gains: Gains
     load_torque: Mapping[EpisodeKey, AnyArray]  # that the load takes from the flange, inertia and gravity, (n_samples,)
 
@@ -144,7 +142,7 @@ class Truth:
     def as_dict(self) -> Record:
         """Return everything but the long signals, ready for JSON: one entry per unit."""
         units = by_unit(self.unit_ids, self.parameters)
-        return {"plant": "harmonic-drive", "loop": self.loop.value, "gains": asdict(self.gains), "units": units}
+        return {"plant": "harmonic-drive", "loop": self.loop, "gains": asdict(self.gains), "units": units}
 
 
 @dataclass(frozen=True)
@@ -161,23 +159,22 @@ class HarmonicDrivePopulation(BatchSettings):
     """
 
     n_units: int = 12
-    loop: Loop | str = Loop.STIFF  # stiff or soft velocity loop
+    loop: str = "stiff"  # stiff or soft velocity loop
     conditions: Names = CONDITIONS  # among "noload" and "load"
 
-    plant: ClassVar[str] = "harmonic-drive"
-    least_seconds: ClassVar[float] = 2.0
-    serial: ClassVar[tuple[int, int]] = (1001, 6)
-    outlier_stream: ClassVar[tuple[int, ...]] = (OUTLIER_STREAM, 0)
+    plant, least_seconds = "harmonic-drive", 2.0
+    serial, outlier_stream = (1001, 6), (OUTLIER_STREAM, 0)
     parameters, outlier_log_factors = NOMINAL, OUTLIER_LOG_FACTORS
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "loop", member(Loop, self.loop, "Harmonic Drive population: the loop"))
+        if self.loop not in GAINS:
+            raise ConfigError(f"Harmonic Drive population: loop {self.loop!r} should be one of {', '.join(GAINS)}.")
         object.__setattr__(self, "conditions", tuple(self.conditions))
         if not self.conditions or sorted(self.conditions) != sorted({*self.conditions} & {*CONDITIONS}):
             raise ConfigError(f"Harmonic Drive population: conditions {self.conditions} should be among {CONDITIONS}.")
 
-    def simulate(self) -> SimulatedPopulation[Truth]:
+    def simulate(self) -> SimulatedPopulation:
         """Simulate all episodes of all units, as the reader of the raw layout yields them and, `raw`, as recorded.
 
         Raw episodes have a second at rest at the start and an offset of the measured position.
@@ -187,11 +184,11 @@ class HarmonicDrivePopulation(BatchSettings):
         keys = tuple(EpisodeKey(u.id, c, str(e)) for u in units for c in conditions for e in range(self.n_episodes))
         row, condition, episode = np.unravel_index(np.arange(len(keys)), (len(units), len(conditions), self.n_episodes))
         loaded = np.array([c == "load" for c in conditions], float)[condition]
-        samples, loop = round(self.seconds / SAMPLE_PERIOD_S) + 1, Loop(self.loop)
+        samples, gains = round(self.seconds / SAMPLE_PERIOD_S) + 1, GAINS[self.loop]
         inputs = [np.stack(episode_reference(self.seed, e, samples, REST_SAMPLES)) for e in range(self.n_episodes)]
         position, velocity = np.stack(inputs, axis=1)
-        states, true, torque = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
-        parts = dict[EpisodeKey, tuple[Array, Array, Array]]()
+        states, true, torque = simulate(parameters.take(row), loaded, episode, (position, velocity), gains)
+        parts = {}
         for i, key in enumerate(keys):  # what the recording adds: an offset of the position, noise on the current
             rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
             states[i, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
@@ -200,7 +197,7 @@ class HarmonicDrivePopulation(BatchSettings):
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
         load_torque = dict(zip((k for k in keys if k.condition == "load"), torque[:, REST_SAMPLES:-1], strict=True))
-        truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_torque)
+        truth = Truth(tuple(u.id for u in units), parameters, self.loop, gains, load_torque)
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
     def draw(self, rng: np.random.Generator) -> Record:

@@ -22,9 +22,8 @@ from kros.core.artifacts import save_artifact, write_json
 from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace
 from kros.report.figures import FIGURES, draw
-from kros.report.figures.entries import entry_names
 from kros.report.figures.responses import scaled_filter
-from kros.report.figures.uncertainty import published_bounds
+from kros.report.figures.uncertainty import entry_names, published_bounds
 from kros.report.files import write_figures
 from kros.report.html import render
 from kros.report.manifest import Artefact, describe, write_manifest

@@ -11,7 +11,7 @@ from kros.identify.survey import RecordingFacts
 from kros.lifting import Lifting
 from kros.observer import EstimatorSettings, Observer
 from kros.plants import HarmonicDrivePopulation
-from kros.report.figures.load import load_torque
+from kros.report.figures.episodes import load_torque
 from kros.study.config import LoadConfig
 from kros.study.engine.store import Store
 from kros.study.stages.load import require_load, run_load

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core import AnyArray, ArrayLike, Record
 from .names import RAISED
-from .theme import DRAWING
+from .theme import DRAWING, Tone
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
@@ -46,6 +46,11 @@ def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, fl
     """Write a small text at a place in shares of the axes, moved by an offset in points."""
     settings: Record = {"xycoords": "axes fraction", "size": "small"} | options
     axes.annotate(text, at, xytext=offset, textcoords="offset points", **settings)
+
+
+def dashed(axes: Axes, level: float) -> None:
+    """Draw a level that values are compared with."""
+    axes.axhline(level, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
 
 
 def decibel(values: ArrayLike) -> AnyArray:

@@ -58,7 +58,7 @@ def flat(content: ByName, before: str = "") -> Iterator[tuple[str, Any]]:
 
 def lines(names: Sequence[str], differing: Mapping[str, Mapping[str, Sequence[Any]]]) -> list[str]:
     """Return a table for every topic, with a row for everything that differs and a column for every run."""
-    shown = list[str]()
+    shown = []
     for topic, rows in differing.items():
         table = aligned([("", *names), *((name, *values) for name, values in rows.items())]) if rows else []
         shown += ["", topic if rows else f"{topic}: nothing differs", *table]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import ByName, Names, frozen, grouped
+from ..core import TINY, ByName, Names, frozen, grouped
 from ..data import natural_key
 from ..design.task import split_name
 from .names import in_condition, number, observer_label, readable_unit, words
@@ -76,7 +76,7 @@ class ErrorTable:
         values = [self.cells[observer].get(c, ErrorCell()).mean for c in channels]
         if not values or None in values:
             return float("inf")
-        return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), np.finfo(float).tiny)))))
+        return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), TINY)))))
 
 
 def _cell(rows: Sequence[Any], interval: Sequence[float]) -> ErrorCell:

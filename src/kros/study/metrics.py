@@ -55,7 +55,7 @@ def _study(context: Context, done: list[Stage]) -> Record:
 
 
 def _units(context: Context, done: list[Stage]) -> list[Record]:
-    facts, rows = context.facts, list[Record]()
+    facts, rows = context.facts, []
     calibration = context.calibration if Stage.CALIBRATE in done else None
     models = context.identified.models() if Stage.IDENTIFY in done else None
     for unit, group in facts.groups.items():

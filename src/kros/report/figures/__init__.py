@@ -39,7 +39,7 @@ FIGURES: dict[str, Row] = {
     "observers_in_time": Row("Estimates", "episodes:estimates", _SMALL),
     "observers_in_time_paper": Row("The paper's estimates", "episodes:paper_estimates", _SMALL),
     "loaded_paper": Row("Errors in another condition", "episodes:other_condition", _SMALL),
-    "load_torque": Row("Load torque", "load:load_torque", "The nearer to the declared load, the better."),
+    "load_torque": Row("Load torque", "episodes:load_torque", "The nearer to the declared load, the better."),
     "outlier_scores": Row("Outlier scores", "outliers:scores", "The higher a unit, the more it differs."),
     "outlier_residuals": Row("Highest score", "uncertainty:outlier_residuals", "It differs where red leaves black."),
 }
@@ -110,5 +110,4 @@ def plot(result: Any, kind: str | None, **options: Any) -> Figure:
     if not set(options) <= set(known):
         raise ConfigError(f"Plot: no option {', '.join(options)}; {kind!r} has {', '.join(known) or 'none'}.")
     with style():
-        figure: Figure = function(result, **options)
-    return figure
+        return function(result, **options)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...core import AnyArray, ConfigError, frozen
-from ...data import Channel
+from ...data import Channel, Role
 from ...evaluate import fit_percent
 from ...evaluate.errors import error_spectrum
 from ...evaluate.held_out import HeldOut
@@ -21,6 +21,7 @@ from ..names import (
     Look,
     condition_label,
     episode_title,
+    in_condition,
     is_koopman,
     joined,
     linear_first,
@@ -98,6 +99,23 @@ def other_condition(run: RunFolder) -> Captioned:
 def paper_estimates(run: RunFolder) -> Captioned:
     """Draw estimates of the paper's observers."""
     return estimates(run, paper=True)
+
+
+def load_torque(run: RunFolder) -> Captioned:
+    """Draw estimates of the load on an episode, a row a way to estimate."""
+    content, blocks = run.evaluation.get("load_torque"), []
+    if content is None:
+        raise NotShownError("this study declares no load; set load.moment")
+    shown = Shown.load(run.folder / "load")
+    ways = {"load": "load state", "current": "error of the recorded current"}
+    for way, label in ways.items():
+        estimates = {n: values for n, values in shown.observers.items() if n.endswith(f"/{way}")}
+        lines = {model_label(n.partition("/")[0]): (values, model_look(n)) for n, values in estimates.items()}
+        blocks += [Block(label, shown, lines, [0], "declared load")] if lines else []
+    parts = [f"{r['observer']} {r['error_percent']:.0f} % of the load" for r in content["rows"]]
+    text = f"Unit {shown.key.unit}{in_condition(shown.key.condition)}, in units of current. Errors below 5 Hz over all "
+    text += f"units whose load was not known: {'; '.join(parts)}."
+    return blocks_figure([Channel("load", Role.STATE)], blocks), text
 
 
 def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[int]) -> Block:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...data import natural_key, some
 from ...uncertainty import OutlierModel
-from ..canvas import Axes, Captioned, grid, note, units_axis
+from ..canvas import Axes, Captioned, dashed, grid, note, units_axis
 from ..names import condition_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
@@ -48,6 +48,6 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         if score.outlier or score is highest:
             note(axes, score.unit, (place, score.score_db), (8, 0), xycoords="data", va="center", color=tone)
     if np.isfinite(model.threshold_db):
-        axes.axhline(model.threshold_db, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
+        dashed(axes, model.threshold_db)
         text = f"threshold, {number(model.threshold_db)} dB"
         note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")

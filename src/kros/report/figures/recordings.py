@@ -9,7 +9,7 @@ import numpy as np
 from ...core import AnyArray, ConfigError
 from ...data import Channel, Population
 from ...evaluate.errors import error_spectrum
-from ..canvas import Captioned, Figure, grid, label_below, legend, logarithmic, note, set_titles, units_axis
+from ..canvas import Captioned, Figure, dashed, grid, label_below, legend, logarithmic, note, set_titles, units_axis
 from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
@@ -108,8 +108,8 @@ def phase(run: RunFolder) -> Captioned:
         units_axis(panel, units)
     set_titles(axes[0], ("phase (°)", "lag (°)", "concentration"))
     axes[0, 0].set_yticks([0, 180, 360])
-    axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT, lw=DRAWING.thin, ls="--")
-    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT, lw=DRAWING.thin, ls="--")
+    dashed(axes[0, 1], np.degrees(calibration.lag_rad))
+    dashed(axes[0, 2], DRAWING.concentrated)
     lags = columns[1, inside]
     mean, low, high = (minus(f"{value:.0f}°") for value in (np.mean(lags), lags.min(), lags.max()))
     return figure, f"The lag of the loop is {mean} in the mean, from {low} to {high}."

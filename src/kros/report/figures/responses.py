@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...core import AnyArray, StateSpace, gain, grouped
+from ...core import AnyArray, StateSpace, grouped
 from ...design.task import split_name
 from ...identify import IdentifiedModels, ModelSet
 from ...synthesis.result import Injection, Synthesis
@@ -14,7 +14,7 @@ from ..canvas import Captioned, Figure, decibel, frequency_axis, grid, legend, l
 from ..names import label_of, method_look, model_label, model_look, words
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone
-from .entries import short
+from .uncertainty import short
 
 Curve = tuple[str, AnyArray, str, str]
 
@@ -89,7 +89,5 @@ def _curves(run: RunFolder, name: str, observers: Sequence[str], freqs: AnyArray
 
 def scaled_filter(synthesis: Synthesis, models: ModelSet) -> StateSpace:
     """Return the correction filter with innovation and correction over the largest values of their signals."""
-    K = synthesis.controller
-    inside = models.output_scale[list(models.measured)]
     outside = models.input_scale if synthesis.injection is Injection.INPUT else models.output_scale
-    return gain(np.diag(1 / outside), K.dt) @ K @ gain(np.diag(inside), K.dt)
+    return synthesis.controller.multiplied(1 / outside, models.output_scale[list(models.measured)])

@@ -47,7 +47,7 @@ def certificates(facts: Facts) -> Section | None:
 
 def _table(facts: Facts) -> Table | None:
     """Return one row an observer with a model."""
-    rows, errors = list[Row](), facts.tables[0].cells if facts.tables else {}
+    rows, errors = [], facts.tables[0].cells if facts.tables else {}
     for name, entry in facts.observers.items():
         if entry.get("status") == "failed" or not split_name(name)[0]:
             continue

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ...core import ByName
-from ..content import Column, Row, Section, Table, build
+from ..content import Column, Section, Table, build
 from ..facts import Facts
 from ..names import joined, label_of, number, words
 
@@ -41,7 +41,7 @@ def deployment(facts: Facts) -> Section | None:
 
 def _needed(facts: Facts, entry: ByName) -> Table | None:
     """Return the errors of measurements that cost one percent in each estimate; None where no gain is known."""
-    rows = list[Row]()
+    rows = []
     for channel, kinds in entry.get("sensor_gains", {}).items():
         share = entry["largest"][channel] / 100
         for kind, gains in kinds.items():

@@ -84,7 +84,7 @@ def spread(facts: Facts) -> Section | None:
         f"six forms; its peak is the largest singular value over units and frequencies. The design uses the form "
         f"“{words(first['form'])}”. Below 0 dB a unit differs by less than the whole signal."
     )
-    rows = list[Row]()
+    rows = []
     for form in first["peak_db"]:
         peaks = {name: entry["peak_db"][form] for name, entry in entries.items()}
         rows.append({"form": words(form), "used": "used" if form == first["form"] else "", **peaks})
@@ -103,7 +103,7 @@ def uncertainty(facts: Facts) -> Section | None:
         "Each residual is W_left · Δ · W_right with ‖Δ‖ ≤ 1. The weights bound every unit where no normalised residual "
         "exceeds one. The approximation error is what the form cannot represent; it is covered by an additive term."
     )
-    rows = list[Row]()
+    rows = []
     for name, entry in entries.items():
         weight, noise = entry["weight"], entry.get("noise_share")
         row = {

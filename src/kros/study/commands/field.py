@@ -92,7 +92,7 @@ def load_observer(context: Context, name: str = "deployed") -> Observer:
     known = {"deployed": DEPLOYED} | {n: ("observers", f"{n}.json") for n in context.observers_record["names"]}
     known |= {f"{k}/{LOAD}": (LOAD, f"{k}.json") for k in ("koopman", "linear") if store.holds(LOAD, f"{k}.json")}
     if name not in known:
-        hint = did_you_mean(name, known) or ";"
+        hint = did_you_mean(name, known)
         raise ConfigError(f"Run {store.folder}: has no observer {name!r}{hint} known are {', '.join(known)}.")
     chosen, about = Observer.load(store.path(*known[name])), context.deployed.about
     if chosen.about:
@@ -124,7 +124,7 @@ class FieldRecordings:
     observer: Observer
     population: Population
     values: Values
-    sources: dict[str, str] = field(default_factory=dict)
+    sources: Texts = field(default_factory=dict)
     name: str | None = None  # of the parameter that a phase-locked loop follows
 
     @classmethod

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from ...core import ConfigError, Record
 from ...loops.compiler import COMPILERS
@@ -46,7 +45,7 @@ def _version(name: str) -> str:
 def ranking(facts: Facts) -> list[str]:
     """Return one line an observer, the smallest error of the hidden channels first."""
     table, hidden = facts.table, facts.table.hidden
-    rows = list[Sequence[Any]]()
+    rows = []
     for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
         means = {channel: cell.shown for channel, cell in table.cells[name].items()}
         rows.append((f"{name}{'  <- deployed' if name == facts.deployed else ''}", *map(means.get, hidden)))

@@ -70,7 +70,7 @@ def _noise(context: Context, models: ModelSet, uncertain: UncertainModel) -> Cal
     """Return work that compares variation and noise of EDMD models of some units, the nominal one among them."""
     units = uncertain.unit_ids
     chosen = [units[k] for k in np.union1d(evenly(len(units), DEFAULT.units), [uncertain.nominal])]
-    identified, parts = context.identified, list[Array]()
+    identified, parts = context.identified, []
     recorded = identified.factors[context.facts.identify_on]
     for unit in chosen:
         factor = recorded.factor[recorded.rows_of(unit)]

@@ -11,7 +11,7 @@ from typing import get_args
 import numpy as np
 
 from ...core import AnyArray, Array, KrosError, Record, save_artifact
-from ...data import EpisodeKey
+from ...data.population import Keys
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
 from ...design.training import TrainingSet
@@ -83,7 +83,7 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     identified, sensor = context.identified, context.config.sensor
     first = identified.models()
     training, whole = TrainingSet.of(identified, first, sensor), TrainingSet.whole(identified, first, sensor)
-    makers = dict[str, Callable[[], Baseline]]()
+    makers = {}
     if first.lifting.functions or first.lifting.input_functions:
         noise = measurement_noise(identified, first, sensor)
         makers[f"{first.name}/ekf"] = partial(make_extended, training, first, context.uncertain.nominal, noise)
@@ -102,7 +102,7 @@ def band_hz(context: Context) -> tuple[float, float] | None:
     return gearbox_band_hz(context.config.calibrate, context.population, top_speed)
 
 
-def showcase(context: Context, episodes: HeldOut) -> tuple[EpisodeKey, ...]:
+def showcase(context: Context, episodes: HeldOut) -> Keys:
     """Choose the episodes to display: nominal, worst off-nominal, and the nominal unit in every other condition."""
     home, uncertain = context.facts.identify_on, context.uncertain
     others = sorted({k.condition for k in episodes.keys} - {home})

@@ -122,7 +122,7 @@ def next_unit(context: Context) -> Record:
     splits = split_episodes(population, test).values()
     own = replace(facts, train=tuple(key for split in splits for key in split.train))
     values, _, failed = unit_values(population, context.calibration, home, facts=own)
-    rows = Rows()
+    rows = []
     if keys := tuple(key for split in splits for key in split.test if key.unit not in failed):
         episodes = HeldOut(population, keys, values, sensor=context.config.sensor, band_hz=band_hz(context))
         (outcome,) = episodes.observers([context.deployed])

@@ -65,7 +65,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> Record:
     makers = {f"{kind}/{LOAD}": partial(_with_load, trial, kind, lifting) for kind, lifting in liftings.items()}
     names = [f"{kind}/{TRIAL.unaware}" for kind in liftings]
     makers |= {f"{n}/current": partial(_from_current, trial, observers[n]) for n in names if n in observers}
-    curves, facts = dict[str, Array](), dict[str, Record]()
+    curves, facts = {}, {}
     for name, make in makers.items():
         try:
             curves[name], fact = make()

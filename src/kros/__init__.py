@@ -8,8 +8,6 @@ how well and why.
 Importing this package imports nothing else: ``kros.synthesis``, ``kros.data`` and the others load when first used.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

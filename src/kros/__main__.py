@@ -1,7 +1,5 @@
 """``python -m kros`` is the command `kros`."""
 
-from __future__ import annotations
-
 from .cli import app
 
 if __name__ == "__main__":

@@ -4,8 +4,6 @@ Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was w
 met; 4 `kros check` cannot decide on a unit; 128 and the number of a signal that stopped it. See `edge`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

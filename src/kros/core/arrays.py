@@ -1,7 +1,5 @@
 """Types of arrays, of names and of records, and objects that hold arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, dataclass_transform

@@ -3,8 +3,6 @@
 Files appear whole or not at all, and are not read once changed. An edited JSON file without ``checksum`` is accepted.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Files: opened only when they are regular, read up to a limit, written whole."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

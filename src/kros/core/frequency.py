@@ -1,7 +1,5 @@
 """Frequency grids."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from .arrays import Array

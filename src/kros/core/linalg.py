@@ -3,8 +3,6 @@
 Many small matrices have their axes first, `(row, column, ...)`: LAPACK takes stacks of 2 x 2 matrices one by one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from .arrays import AnyArray, Array, ArrayLike

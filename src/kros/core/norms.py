@@ -15,8 +15,6 @@ N. A. Bruinsma and M. Steinbuch, "A fast algorithm to compute the H-infinity nor
 Systems & Control Letters 14 (1990) 287-293.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from operator import itemgetter

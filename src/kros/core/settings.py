@@ -1,7 +1,5 @@
 """Settings: what a function takes beside its data, with defaults and limits in one place for Python and TOML alike."""
 
-from __future__ import annotations
-
 from enum import Enum
 from typing import Any, Self, TypeVar, get_args, get_origin
 

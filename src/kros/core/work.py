@@ -4,8 +4,6 @@ Results of maps are in a store, by the digest of all that they follow from. The 
 it, on a cluster too. Numbers come back bit by bit; what cannot be read back whole is computed again.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator

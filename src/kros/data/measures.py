@@ -1,7 +1,5 @@
 """Units of measure: how headers write them, what kind of quantity they measure, and their conversion to SI by pint."""
 
-from __future__ import annotations
-
 import math
 import re
 import unicodedata

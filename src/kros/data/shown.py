@@ -1,7 +1,5 @@
 """Objects that show themselves: a summary as text or HTML, and figures that `kros.report` draws when asked."""
 
-from __future__ import annotations
-
 from html import escape
 from importlib import import_module
 from typing import Any

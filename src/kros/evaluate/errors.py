@@ -5,8 +5,6 @@ observer that was made to agree with the recording then trails as well, and its 
 show it; error and lag against the truth do.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..core import Array, Whole

@@ -1,7 +1,5 @@
 """Errors of observers, baselines and models on held-out episodes, and trajectories for figures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field, replace
 

@@ -11,8 +11,6 @@ was fixed before (V. Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a
 4.2; H. Papadopoulos et al., Inductive Confidence Machines for Regression, ECML 2002).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import ceil
 from operator import itemgetter

@@ -4,8 +4,6 @@ Random draws belong to an episode, by its key: they are the same in whatever bat
 in whatever units.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from zlib import crc32

@@ -13,8 +13,6 @@ c says of the angle, it is no load: changes are counted again from there, and wh
 unloaded machine needs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -9,8 +9,6 @@ the level is missing there too, of the current:
 Its bank has one lag with the same forgetting: the integral of the tracking error, which the drive's controller holds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What simulated populations have in common: recordings with their truth, drawn parameters, an outlier, sensors."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields

@@ -9,8 +9,6 @@ Position comes from an encoder, velocity and current from noisy sensors. `tanh(v
 exactly.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..core import Array, frozen

@@ -6,8 +6,6 @@ The input `u` is a pseudorandom staircase, held between samples. Position comes 
 sensor.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..core import Array, frozen

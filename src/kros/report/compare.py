@@ -1,7 +1,5 @@
 """Runs beside each other: in which settings they differ, and in what these lead to, from settings and metrics."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

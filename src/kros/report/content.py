@@ -3,8 +3,6 @@
 To add a column to a table, add one `Column` where the section builds it: a title and the key of its values in the rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import groupby
 from math import isfinite

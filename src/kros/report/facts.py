@@ -3,8 +3,6 @@
 Errors of observers are in tables by condition, observer and channel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import field
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Figures to bytes and files: SVG for the page, PNG and PDF for papers and slides."""
 
-from __future__ import annotations
-
 import io
 import logging
 import re

@@ -1,7 +1,5 @@
 """The report: one HTML file with everything in it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

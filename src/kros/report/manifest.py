@@ -7,8 +7,6 @@
 A digest is of settings, inputs and source, so what is there need not be computed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath

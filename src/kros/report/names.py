@@ -1,7 +1,5 @@
 """What models, observers and channels are called and coloured: the same in every figure, table and sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
 

@@ -3,8 +3,6 @@
 Only files in the records of the run count. What a run does not have raises `NotShownError`, whose message says why.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import field

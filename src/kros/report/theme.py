@@ -4,8 +4,6 @@ A figure is drawn in the light tones; in the report's inline SVG every tone is a
 Hues follow Okabe and Ito and stay apart for colour-blind readers; meaning is never carried by hue alone.
 """
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 from enum import StrEnum
 from typing import Self

@@ -1,7 +1,5 @@
 """Verdicts of `kros check` in words, and as CSV, HTML and JUnit XML."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable, Sequence

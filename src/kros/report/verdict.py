@@ -3,8 +3,6 @@
 The head of the report and the lines behind ``kros run`` both come from here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from enum import Enum
 from math import inf

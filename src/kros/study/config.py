@@ -1,7 +1,5 @@
 """The study: one TOML file, validated; unknown keys are errors; the resolved form is stored with the results."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Sequence
 from enum import StrEnum

@@ -3,8 +3,6 @@
 What was not run is absent, what is unknown is null, nothing is invented.
 """
 
-from __future__ import annotations
-
 from ..core import Record, load_artifact, plain
 from ..observer.sensor_gains import sensor_gains
 from ..uncertainty import UncertainModel

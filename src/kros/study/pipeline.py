@@ -1,7 +1,5 @@
 """A whole study in a run folder, and what it leaves behind."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How a text file of numbers is written: encoding, delimiter, decimal point, header and rows of units."""
 
-from __future__ import annotations
-
 import codecs
 import csv
 import re

@@ -3,8 +3,6 @@
 folder ── dialect ── names of files ── columns ── parts ── mapping ── every episode looked at ── Discovery
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence

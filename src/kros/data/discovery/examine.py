@@ -1,7 +1,5 @@
 """What looks wrong in recordings, found in one pass before anything is computed: nothing stops at the first of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

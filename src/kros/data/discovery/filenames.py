@@ -4,8 +4,6 @@ A path is cut into words. What differs between paths is told apart by the word t
 it (``run_3``), by what conditions are called, and else by its place: units before episodes.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from itertools import chain, groupby

@@ -1,7 +1,5 @@
 """Columns of a table: units of measure, kinds of quantities, names of channels, and what they are likely to be."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import Enum

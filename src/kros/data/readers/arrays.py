@@ -1,7 +1,5 @@
 """Recordings that are in memory already: arrays, or a long pandas DataFrame."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 

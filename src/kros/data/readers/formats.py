@@ -3,8 +3,6 @@
 A format is a function that yields signals by name, nested as in the file, and their units of measure.
 """
 
-from __future__ import annotations
-
 import gc
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

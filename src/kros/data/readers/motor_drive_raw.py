@@ -7,8 +7,6 @@ full scale), target position (deg), target velocity (deg/s), all on the motor si
 declares the preparation.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Open recordings by the name of a reader, and tell which reader fits a folder."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from pathlib import Path
 

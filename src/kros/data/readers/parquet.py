@@ -8,8 +8,6 @@ Names of files are percent-encoded, so any id works. A study writes groups from 
 then the index.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import astuple, field, replace

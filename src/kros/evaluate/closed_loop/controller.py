@@ -1,7 +1,5 @@
 """A controller that uses estimates, as people give it: matrices and names of signals."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Self
 

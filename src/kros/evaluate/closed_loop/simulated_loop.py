@@ -1,7 +1,5 @@
 """Loops in simulation: nonlinear models of all units, the observer as deployed, a controller that may saturate."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ...core import Names

@@ -5,8 +5,6 @@ perturbation of the set is inside: small gain decides on stability, and the wors
 place of the bound that is void. Beside this stands a simulation of every unit with the observer as it is deployed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -6,8 +6,6 @@ The resulting velocity resembles a smoothed pseudorandom binary sequence (sectio
 backward almost all the time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 

@@ -1,7 +1,5 @@
 """Signals in time: recorded and estimated values, errors, and their spectra."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Outlier scores of all units beside the threshold, with their range over all nominal units, a row a condition."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ...data import natural_key, some

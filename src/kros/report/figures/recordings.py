@@ -1,7 +1,5 @@
 """Figures of the recordings: signals, the tracking error's spectrum, and the phase of every unit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frequency responses: models of all units, and correction filters beside plant and weights."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

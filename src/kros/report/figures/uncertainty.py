@@ -1,7 +1,5 @@
 """Figures of residuals and weights: six forms, weights over the optimal bound, entries of single units."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

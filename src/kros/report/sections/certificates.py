@@ -1,7 +1,5 @@
 """What is certified about every observer, under which assumptions, and how it was recomputed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from ...core import ByName

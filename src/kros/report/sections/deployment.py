@@ -1,7 +1,5 @@
 """What the deployed observer reads, estimates and needs, and what is certified about it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from ...core import ByName

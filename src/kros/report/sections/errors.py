@@ -1,7 +1,5 @@
 """Errors of observers on held-out episodes: in the condition of the models, in others, on units left out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from ..content import Column, Row, Section, Table, build

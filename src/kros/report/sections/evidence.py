@@ -1,7 +1,5 @@
 """Where the numbers come from: recordings, models, spread of the units, weights, the run."""
 
-from __future__ import annotations
-
 import math
 import platform
 from importlib import import_module

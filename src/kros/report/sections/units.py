@@ -1,7 +1,5 @@
 """Every unit: errors of the deployed observer, outlier scores and phase."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from operator import itemgetter

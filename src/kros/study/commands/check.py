@@ -1,7 +1,5 @@
 """`kros check`: scores of new units against a finished study, the level of the innovation on them, and the verdicts."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections import Counter

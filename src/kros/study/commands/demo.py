@@ -1,7 +1,5 @@
 """Simulated recordings on disk, and the whole study on them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from pathlib import Path

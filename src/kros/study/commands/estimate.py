@@ -1,7 +1,5 @@
 """`kros estimate`: estimates beside what was recorded, with time, status and error band, in the recordings' units."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Collection
 from pathlib import Path

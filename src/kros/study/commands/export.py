@@ -1,7 +1,5 @@
 """A run's observer as C99 source, or as a functional mock-up unit."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

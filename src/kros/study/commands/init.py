@@ -1,7 +1,5 @@
 """`kros init`: look at a folder of recordings, write the study that runs on it, and say what looks wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 import textwrap

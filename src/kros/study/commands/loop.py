@@ -1,7 +1,5 @@
 """`kros loop`: whether a controller may use the estimates of a run's observer."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ...core import read_json

@@ -1,7 +1,5 @@
 """A few lines for people at a terminal: about a run, and about what is installed."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 from collections.abc import Sequence

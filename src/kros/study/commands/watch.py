@@ -6,8 +6,6 @@ The result file is named by the recording, its size and the time of its last cha
 What has one is done, all else is not, and nothing else is remembered. A recording at rest is the same in two looks.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """What every stage gets, and the stages in order: each is run, or found done by the digest of what it follows from."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

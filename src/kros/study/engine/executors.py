@@ -4,8 +4,6 @@ The order of the sums in a matrix product depends on the number of threads, so e
 hold one end of a pipe whose other end is this process's alone: they end when it is closed.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import socket

@@ -1,7 +1,5 @@
 """Run folders are locked while they are used."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

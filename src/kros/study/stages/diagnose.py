@@ -5,8 +5,6 @@ residuals of all units            --> beside the weights                        
 the most conspicuous unit         --> against the cover of all the others                    outliers/<models>/others
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Stage: run every model freely and every observer on all held-out episodes of all units in all conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

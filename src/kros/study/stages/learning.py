@@ -1,7 +1,5 @@
 """The stages from recordings to observers, which are repeated where units are left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from shutil import copyfile
 

@@ -8,8 +8,6 @@ Units in reserve are a fold that the study itself does not use: only the deploye
 bound those of the next unit.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Stage: write the report; also the entry points of `kros report` and `kros figures`."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner, Result
 
 from kros.plants import DcMotorPopulation
 
-pytest.importorskip("check_jsonschema")
+check_jsonschema = pytest.importorskip("check_jsonschema")
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def check(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "check_jsonschema", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+def check(*arguments: object) -> Result:
+    return CliRunner().invoke(check_jsonschema.main, list(map(str, arguments)))
 
 
 @pytest.fixture(scope="module")
@@ -38,16 +36,16 @@ def study(kros, tmp_path_factory) -> Path:
 
 def test_the_schema_is_one_and_is_printed(kros, study) -> None:
     schema = study.with_name("study.schema.json")
-    assert check("--check-metaschema", schema).returncode == 0
+    assert check("--check-metaschema", schema).exit_code == 0
     assert json.loads(kros("schema").output) == json.loads(schema.read_text())
     assert study.read_text().splitlines()[0] == "#:schema ./study.schema.json"
 
 
 def test_studies_are_valid_by_it(study) -> None:
-    examples = [path for path in EXAMPLES.glob("*/study.toml")]
+    examples = list(EXAMPLES.glob("*/study.toml"))
     assert len(examples) > 2
     result = check("--schemafile", study.with_name("study.schema.json"), study, *examples)
-    assert result.returncode == 0, result.stdout
+    assert result.exit_code == 0, result.stdout
 
 
 @pytest.mark.parametrize(
@@ -62,5 +60,5 @@ def test_mistakes_are_found(study, tmp_path, right, wrong, found) -> None:
     path = tmp_path / "study.toml"
     path.write_text(study.read_text().replace(right, wrong, 1))
     result = check("--schemafile", study.with_name("study.schema.json"), path)
-    assert result.returncode == 1
+    assert result.exit_code == 1
     assert found in result.stdout

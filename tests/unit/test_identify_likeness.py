@@ -14,24 +14,27 @@ def motors():
     return kros.plants.DcMotorPopulation(n_units=5, n_episodes=2, seconds=1.0, seed=3, spread=3.0).simulate().population
 
 
-def alerts(motors, factors: dict[tuple[str, str], float]) -> tuple[str, ...]:
-    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
-    for (unit, name), factor in factors.items():
-        for values in data[unit]:
-            values[:, [c.name for c in motors.channels].index(name)] *= factor
+def copied(motors) -> dict[str, list[np.ndarray]]:
+    return {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+
+
+def alerts(motors, data: dict[str, list[np.ndarray]]) -> tuple[str, ...]:
     names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
     found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)
     return kros.identify(found, refine=False).facts.alerts
 
 
 def test_a_batch_with_spread_is_not_doubted(motors) -> None:
-    assert alerts(motors, {}) == ()
+    assert alerts(motors, copied(motors)) == ()
 
 
-@pytest.mark.parametrize("name", ["position", "velocity", "current", "voltage"])
-def test_another_sign_and_another_unit_of_measure_are_named(motors, name: str) -> None:
-    one, other = motors.unit_ids[1], motors.unit_ids[3]
-    against, size = alerts(motors, {(one, name): -1.0, (other, name): np.pi / 180})
+@pytest.mark.parametrize(("column", "name"), list(enumerate(("position", "velocity", "current", "voltage"))))
+def test_another_sign_and_another_unit_of_measure_are_named(motors, column: int, name: str) -> None:
+    data, one, other = copied(motors), motors.unit_ids[1], motors.unit_ids[3]
+    for unit, factor in ((one, -1.0), (other, np.pi / 180)):
+        for values in data[unit]:
+            values[:, column] *= factor
+    against, size = alerts(motors, data)
     assert against == f"Unit {one}: {name} moves against the other channels, unlike in most; check its sign."
     assert size.startswith(f"Unit {other}: {name} moves 0.01")
 
@@ -49,35 +52,28 @@ def test_values_beyond_those_of_all_other_units_are_named() -> None:
 
 
 def test_a_unit_whose_zero_is_another_is_named(motors) -> None:
-    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+    data = copied(motors)
     for values in data[motors.unit_ids[1]]:
         values[:, 0] += 1e4
-    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
-    found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)
-    (alert,) = kros.identify(found, refine=False).facts.alerts
+    (alert,) = alerts(motors, data)
     assert alert.startswith(f"Unit {motors.unit_ids[1]}: position has values between ")
 
 
-@pytest.mark.parametrize("name", ["position", "velocity", "current", "voltage"])
-def test_one_mirrored_episode_of_a_unit_is_named_with_its_channel(motors, name: str) -> None:
-    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
-    data[motors.unit_ids[1]][1][:, [c.name for c in motors.channels].index(name)] *= -1
-    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
-    (alert,) = kros.identify(
-        kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s), refine=False
-    ).facts.alerts
+@pytest.mark.parametrize(("column", "name"), list(enumerate(("position", "velocity", "current", "voltage"))))
+def test_one_mirrored_episode_of_a_unit_is_named_with_its_channel(motors, column: int, name: str) -> None:
+    data = copied(motors)
+    data[motors.unit_ids[1]][1][:, column] *= -1
+    (alert,) = alerts(motors, data)
     episode = f"Episode 1 of unit {motors.unit_ids[1]} (default)"
     assert alert == f"{episode}: {name} moves against the other channels, unlike in most; check its sign."
 
 
 def test_one_episode_with_swapped_columns_is_named(motors) -> None:
-    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+    data = copied(motors)
     swapped = data[motors.unit_ids[1]][1]
     swapped[:, [1, 2]] = swapped[:, [2, 1]]
-    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
-    found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)
-    alerts = kros.identify(found, refine=False).facts.alerts
-    assert any(a.startswith(f"Episode 1 of unit {motors.unit_ids[1]} (default): current moves ") for a in alerts)
+    begin = f"Episode 1 of unit {motors.unit_ids[1]} (default): current moves "
+    assert any(alert.startswith(begin) for alert in alerts(motors, data))
 
 
 def test_a_motion_that_turns_a_correlation_in_every_unit_is_no_mirrored_channel() -> None:
@@ -97,12 +93,10 @@ def test_a_motion_that_turns_a_correlation_in_every_unit_is_no_mirrored_channel(
 
 
 def test_a_sensor_that_fails_for_a_while_is_named_with_its_episode(motors) -> None:
-    data = {unit: [motors.read(key).copy() for key in motors.keys(unit)] for unit in motors.unit_ids}
+    data = copied(motors)
     data[motors.unit_ids[1]][1][300:, 1] = data[motors.unit_ids[1]][1][300, 1]
     data[motors.unit_ids[2]][0][200:203, 0] = -9999.0
-    names = {"states": motors.states, "inputs": motors.inputs, "measured": motors.measured}
-    found = kros.from_arrays(data, **names, sample_period_s=motors.sample_period_s)
-    _, stuck, code = kros.identify(found, refine=False).facts.alerts  # and the size of its position
+    _, stuck, code = alerts(motors, data)  # and the size of its position
     assert stuck.startswith(f"Episode 1 of unit {motors.unit_ids[1]} (default): velocity stays the same for 40 % of it")
     assert code.startswith(f"Episode 0 of unit {motors.unit_ids[2]} (default): position jumps by ")
 
@@ -118,8 +112,10 @@ def test_a_wrapped_angle_is_named(turn: float) -> None:
 
 
 def test_a_unit_that_is_moved_less_is_not_doubted(motors) -> None:
-    names = [c.name for c in motors.channels]
-    assert alerts(motors, {(motors.unit_ids[2], name): 0.05 for name in names}) == ()
+    data = copied(motors)
+    for values in data[motors.unit_ids[2]]:
+        values *= 0.05
+    assert alerts(motors, data) == ()
 
 
 def test_moments_are_covariances_of_channels_and_changes() -> None:

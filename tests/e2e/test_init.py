@@ -21,7 +21,7 @@ DEGREE = np.pi / 180
 @pytest.fixture(scope="module")
 def motors() -> Population:
     """DC motors: position, velocity, current, voltage."""
-    return DcMotorPopulation(n_units=4, n_episodes=4, seconds=5, seed=3).simulate().population
+    return DcMotorPopulation(n_units=4, n_episodes=4, seconds=2, seed=3).simulate().population
 
 
 def comma(value: float) -> str:

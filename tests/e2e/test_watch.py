@@ -11,8 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import watch
 from watch import campaign, make_study, recording
 
 
@@ -29,8 +28,9 @@ def results(out: Path) -> dict[str, list[dict]]:
     return found
 
 
-def test_recordings_under_kills_are_judged_once(tmp_path) -> None:
-    counts = campaign(tmp_path / "few", 10, 2, pause_s=0.01)
+def test_recordings_under_kills_are_judged_once(run, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(watch, "make_study", lambda _: run)
+    counts = campaign(tmp_path, 10, 2, pause_s=0.01)
     assert (counts["recordings with one result"], counts["with more"], counts["judged twice"]) == (10, 0, 0)
     assert sum(counts["verdicts"].values()) == 10
 

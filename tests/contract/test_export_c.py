@@ -33,7 +33,7 @@ needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compil
 @needs_compiler
 @pytest.mark.parametrize("kind", MACHINES)
 def test_same_estimates_and_the_same_status_under_faults(kind, tmp_path):
-    observer, (y, u) = MACHINES[kind](), samples(800)
+    observer, (y, u) = MACHINES[kind](), samples(400)
     wanted, status = in_python(observer, y, u)
     assert len(set(status)) >= 4
     for precision, close in (("double", 1e-9), ("float", 1e-4))[: 1 + (kind in SINGLE)]:
@@ -86,7 +86,7 @@ def test_a_filter_bank_of_two_sensors_of_which_one_or_both_are_lost(tmp_path):
 @needs_compiler
 @pytest.mark.parametrize("kind", ["limits", "through the input", "filter bank"])
 def test_a_parameter_that_follows_the_machine(kind, tmp_path):
-    observer, (y, u) = MACHINES[kind](), samples(800)
+    observer, (y, u) = MACHINES[kind](), samples(400)
     wanted, status = in_python(observer, y, u, "phase")
     for precision, close in (("double", 1e-9), ("float", 1e-4)):
         folder = export_c(observer, tmp_path / precision, "drive", precision, track="phase")
@@ -134,7 +134,7 @@ def test_load_torque_with_its_level(precision, limit, tmp_path):
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_a_thousand_turns_cost_no_accuracy(precision, tmp_path):
-    observer, (y, u) = replace(drive(), seen=None), samples(4000, turns=1000, faults=False)
+    observer, (y, u) = replace(drive(), seen=None), samples(1500, turns=1000, faults=False)
     found, _ = CompiledObserver.build(export_c(observer, tmp_path / "c", "drive", precision)).run(y, u)
     assert apart(found, in_python(observer, y, u)[0]) < (1e-9 if precision == "double" else 1e-4)
 

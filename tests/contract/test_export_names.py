@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import pytest
-from machines import drive, watched
+from machines import drive
 
 from kros.core.errors import ConfigError
 from kros.export import LoadOutput, export_c
@@ -33,7 +33,7 @@ HOSTILE = {
 def named(text):
     """An observer with a hostile name in every slot, and the load that is exported with it."""
     names = [f"{slot} {text}" for slot in ("measured state", "hidden state", "input")]
-    observer = watched(drive(()))
+    observer = drive(())
     about = {"units_of_measure": {names[0]: text}, "columns": {names[0]: {"offset": text}}}
     lifting, inputs = Lifting((names[0], "velocity", names[1])), (names[2], observer.inputs[1])
     observer = replace(observer, name=f"observer {text}", about=about, inputs=inputs, lifting=lifting)

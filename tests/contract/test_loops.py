@@ -51,7 +51,7 @@ def assert_same(found, wanted):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12 * size)
 
 
-def machines_of(count=700, lost=True):
+def machines_of(count=350, lost=True):
     """Faulty samples of machines that differ, shape (count, machine, ...), and their phases; perhaps no input is lost."""
     y, u = (
         np.stack(of, axis=1)

@@ -52,6 +52,20 @@ def low_orders() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def two_figures() -> Iterator[None]:
+    """Reports have two figures, drawn in this process, where studies are about something else: drawing takes longest."""
+    some = ("observers_in_time", "forms")
+
+    def drawn(name: str, run: RunFolder) -> Drawn:
+        return draw(name, run) if name in some else Drawn(name, name, reason="not asked for")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("kros.report.html.draw", drawn)
+        patch.setattr("kros.report.files.FIGURES", dict.fromkeys(some))
+        yield
+
+
 @pytest.fixture(scope="session")
 def kros() -> Iterator[Callable[..., Result]]:
     """Call the command line in this process alone, unless workers are named; returns exit code and what is printed."""
@@ -69,18 +83,20 @@ def kros() -> Iterator[Callable[..., Result]]:
 def recorded(kros, tmp_path_factory) -> Path:
     """Simulated recordings: five units and an outlier, two conditions, four short episodes."""
     out = tmp_path_factory.mktemp("recorded") / "recordings"
-    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 12, "--outlier")
+    result = kros("simulate", out, "--units", 5, "--episodes", 4, "--seconds", 8, "--outlier")
     assert result.exit_code == 0, result.output
     return out
 
 
 @pytest.fixture(scope="session")
 def demo(kros, recorded, tmp_path_factory) -> Path:
-    """A finished study, with fewer rows and points."""
+    """A finished study, with fewer rows and points; `tests/e2e/test_report.py` draws all its figures."""
     folder = tmp_path_factory.mktemp("demo")
+    few = '[observer]\nbaselines = ["open_loop", "kalman_tuned", "filtered_difference", "learned", "mean_profile"]\n'
     quick = f'[estimator]\n{QUICK}[uncertainty]\nn_freqs = 100\n[synthesis]\nmethods = ["worst_case_h2", "estimator"]\n'
-    (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{quick}')
-    result = kros("run", folder / "demo.toml", "--out", folder / "run")
+    (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{few}{quick}')
+    with two_figures():
+        result = kros("run", folder / "demo.toml", "--out", folder / "run")
     assert result.exit_code == 0, result.output
     return folder / "run"
 
@@ -93,7 +109,7 @@ def paper(kros, recorded, tmp_path_factory) -> Path:
     (folder / "paper.toml").write_text(
         f'[data]\nsource = "{recorded}"\nreader = "parquet"\n[identify]\nrefine = false\n{few}'
     )
-    with low_orders():
+    with low_orders(), two_figures():
         result = kros("run", folder / "paper.toml", "--out", folder / "run")
     assert result.exit_code == 0, result.output
     return folder / "run"
@@ -114,15 +130,8 @@ def low_order_weights() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def few_figures() -> Iterator[None]:
-    """Reports have two figures, drawn in this process, where tests are about something else: drawing takes longest."""
-    some = ("observers_in_time", "forms")
-
-    def drawn(name: str, run: RunFolder) -> Drawn:
-        return draw(name, run) if name in some else Drawn(name, name, reason="not asked for")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("kros.report.html.draw", drawn)
-        patch.setattr("kros.report.files.FIGURES", dict.fromkeys(some))
+    """Two figures in all reports of a file."""
+    with two_figures():
         yield
 
 

@@ -63,9 +63,9 @@ def test_a_drive_that_was_left_out_is_estimated_as_well_as_by_a_regression(examp
         ("quanser_qube", set_to("identify.refine=false"), (1, 0.002), {"koopman_edmd": 6, "linear_edmd": 4}),
         (
             "pneumatic",
-            ["--until", "identify"],
+            ["--until", "identify", *set_to("identify.refine=false")],
             (9, 0.02),
-            {"koopman": 3, "linear": 2},
+            {"koopman_edmd": 3, "linear_edmd": 2},
         ),
     ],
 )

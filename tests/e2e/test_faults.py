@@ -13,7 +13,7 @@ from kros.observer import Observer, run_observer
 from kros.observer.certificate.error import error_system
 from kros.observer.screen import screened
 
-AT, GOOD, SAMPLES = 1000, 2000, 8000
+AT, GOOD, SAMPLES = 1000, 2000, 5000
 
 
 def test_what_a_study_hands_over_forgets_faults(demo: Path) -> None:

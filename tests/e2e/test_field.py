@@ -39,7 +39,7 @@ def machines() -> Population:
     settings: dict[str, Any] = {
         "n_units": 2,
         "n_episodes": 2,
-        "seconds": 10.0,
+        "seconds": 5.0,
         "seed": 79,
         "conditions": ("noload",),
         "outlier": True,
@@ -88,8 +88,8 @@ def one_direction(values: np.ndarray) -> np.ndarray:
 
 def with_holes(values: np.ndarray) -> np.ndarray:
     values = values.copy()
-    values[3000:3010, 0] = np.nan
-    values[5000, 1] = np.inf
+    values[1500:1510, 0] = np.nan
+    values[2500, 1] = np.inf
     return values
 
 
@@ -240,15 +240,16 @@ def test_a_controller_over_the_demo_is_judged(kros, demo, tmp_path, gain, code, 
     file = tmp_path / "controller.json"
     content = {"D": [[gain]], "sample_period_s": 0.001, "inputs": ["velocity"], "outputs": ["target_velocity"]}
     file.write_text(json.dumps(content))
-    command = ["loop", demo, "--controller", file, "--observer", "koopman/worst_case_h2"]
-    result = kros(*command, "--json")
+    command = ["loop", demo, "--controller", file, "--observer", "linear/worst_case_h2"]
+    result = kros(*command, *([] if code else ["--json"]))
     assert result.exit_code == code, result.output
-    said = json.loads(result.stdout)
-    assert said["status"] == word
-    assert code or all(radius < 1 for radius in said["spectral_radius"].values())
-    assert code or 1 < said["margin"] <= said["destabilising"]
     if code:
-        assert kros(*command).stdout.startswith(f"{word}: ")
+        assert result.stdout.startswith(f"{word}: ")
+    else:
+        said = json.loads(result.stdout)
+        assert said["status"] == word
+        assert all(radius < 1 for radius in said["spectral_radius"].values())
+        assert 1 < said["margin"] <= said["destabilising"]
     for changed in (content | {"poles": 1}, content | {"inputs": ["speed"]}, content | {"D": [[gain, 0.0]]}):
         file.write_text(json.dumps(changed))
         assert kros("loop", demo, "--controller", file).exit_code == 2

@@ -56,7 +56,8 @@ def test_measured_cells_at_a_tenth_of_a_hertz_run(kros, recordings, tmp_path):
     roles = ("--measured", "voltage", "--input", "current")
     found = kros("init", recordings / "dmegc_cells", *roles, "--out", tmp_path / "study.toml")
     assert found.exit_code == 0, found.output
-    quick = (part for setting in [*QUICK, "identify.refine=false"] for part in ("--set", setting))
+    few = ["identify.refine=false", 'synthesis.methods=["estimator"]', 'observer.baselines=["open_loop", "learned"]']
+    quick = (part for setting in [*QUICK, *few] for part in ("--set", setting))
     done = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--until", "evaluate", *quick)
     assert done.exit_code == 0, done.output
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["evaluation"]

@@ -8,13 +8,19 @@ import pytest
 from kros.data import read, write_parquet
 
 
-@pytest.fixture
-def raw(kros, tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def simulated(kros, tmp_path_factory) -> Path:
     """A small recording in the paper's raw layout."""
-    out = tmp_path / "raw"
+    out = tmp_path_factory.mktemp("simulated") / "raw"
     result = kros("simulate", out, "--units", 2, "--episodes", 3, "--seconds", 5, "--format", "raw")
     assert result.exit_code == 0, result.output
     return out
+
+
+@pytest.fixture
+def raw(simulated, tmp_path) -> Path:
+    """A copy that a test may spoil."""
+    return Path(shutil.copytree(simulated, tmp_path / "raw"))
 
 
 def refused(kros, study, tmp_path, *words, code=2, options=()):

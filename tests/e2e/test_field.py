@@ -83,7 +83,7 @@ def one_direction(values: np.ndarray) -> np.ndarray:
     forward = np.concatenate([[False], values[:, 2] >= -1e-9, [False]])
     edges = np.flatnonzero(np.diff(forward.astype(int)))
     start, stop = max(zip(edges[::2], edges[1::2], strict=True), key=lambda e: e[1] - e[0])
-    return values[start:stop]
+    return values[start : min(stop, start + 1000)]
 
 
 def with_holes(values: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ RECORDED = {name: (*FACTORS.get(name, ("V", 1.0)),) for name in NAMES}
 
 @pytest.fixture(scope="module")
 def motors():
-    return DcMotorPopulation(n_units=3, n_episodes=2, seconds=1.5, seed=3).simulate().population
+    return DcMotorPopulation(n_units=3, n_episodes=2, seconds=1.0, seed=3).simulate().population
 
 
 def as_recorded(values: Array) -> dict[str, Array]:

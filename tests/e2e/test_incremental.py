@@ -19,9 +19,9 @@ from kros.study import run as run_study
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory) -> Path:
-    """Five drives in the raw layout, in two conditions."""
+    """Three drives in the raw layout, in two conditions."""
     folder = tmp_path_factory.mktemp("drives") / "raw"
-    simulated = kros.plants.HarmonicDrivePopulation(n_units=5, n_episodes=3, seconds=6.0, seed=5).simulate()
+    simulated = kros.plants.HarmonicDrivePopulation(n_units=3, n_episodes=3, seconds=4.0, seed=5).simulate()
     kros.data.readers.motor_drive_raw.write_raw(simulated.raw, folder)
     return folder
 
@@ -77,7 +77,7 @@ def fresh(source: Path, tmp_path: Path, **identify: Any) -> dict[str, Any]:
 
 
 def test_a_unit_that_is_new_is_the_only_one_that_is_computed(drives, tmp_path, computed):
-    last = [p for p in folders(drives) if "_001005_" in p.name]
+    last = [p for p in folders(drives) if "_001003_" in p.name]
     assert len(last) == 2
     source = without(drives, tmp_path / "raw", *last)
     run = study(source, tmp_path / "run")
@@ -85,7 +85,7 @@ def test_a_unit_that_is_new_is_the_only_one_that_is_computed(drives, tmp_path, c
     computed.clear()
     study(source, run)
     once = ("calibrate", "identify (noload)", "identify (load)")
-    assert computed == {"read": ["001005"] * 2, **{title: ["001005"] for title in once}}
+    assert computed == {"read": ["001003"] * 2, **{title: ["001003"] for title in once}}
     assert results(run) == fresh(source, tmp_path)
 
 
@@ -144,7 +144,7 @@ def test_another_regularisation_or_lifting_takes_from_earlier_runs_what_does_not
     content |= {"lifting": {"functions": ["cos(100*position + phase)"]}}
     computed.clear()
     run_study(validate_config(content, drives), run, until=Stage.IDENTIFY)
-    assert [len(units) for units in computed.values()] == [0, 5, 5]  # the phase is known, the factors are others
+    assert [len(units) for units in computed.values()] == [0, 3, 3]  # the phase is known, the factors are others
 
 
 @pytest.mark.parametrize("damage", ["changed", "recordings"])

@@ -21,7 +21,7 @@ DEGREE = np.pi / 180
 @pytest.fixture(scope="module")
 def motors() -> Population:
     """DC motors: position, velocity, current, voltage."""
-    return DcMotorPopulation(n_units=4, n_episodes=4, seconds=2, seed=3).simulate().population
+    return DcMotorPopulation(n_units=4, n_episodes=3, seconds=2, seed=3).simulate().population
 
 
 def comma(value: float) -> str:
@@ -92,7 +92,7 @@ def test_every_dialect_is_read_back_as_it_was_written(kros, tmp_path, motors, ki
     assert result.exit_code == 0, result.output
     found = open_source(load_config(study))
     assert len(found.unit_ids) == 4
-    assert [len(keys) for _, _, keys in found.groups()] == [4] * 4
+    assert [len(keys) for _, _, keys in found.groups()] == [3] * 4
     assert found.sample_period_s == pytest.approx(motors.sample_period_s, rel=1e-9)
     assert (len(found.measured), len(found.states), len(found.inputs)) == (1, 3, 1)
     for ours, theirs in zip(found.episodes, motors.episodes, strict=True):
@@ -122,7 +122,7 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
     ):
         assert part in result.output
     found = open_source(load_config(study))
-    assert len(found.episodes) == 14
+    assert len(found.episodes) == 10
     assert (
         EpisodeKey(units[0], "default", "01") not in found.episodes
         or EpisodeKey(units[1], "default", "01") not in found.episodes
@@ -141,7 +141,7 @@ def test_roles_are_taken_from_options(kros, tmp_path, motors):
     folder, study = tmp_path / "recordings", tmp_path / "study.toml"
     folder.mkdir()
     form = {"delimiter": ",", "header": "aa,bb,cc,dd", "comments": "", "fmt": "%.10g"}
-    for key in motors.episodes[:8]:
+    for key in motors.episodes[:6]:
         np.savetxt(folder / f"{key.unit}_{key.episode}.csv", motors.read(key), **form)
 
     def refused(words: str, *options: object) -> None:
@@ -168,7 +168,7 @@ def test_roles_are_taken_from_options(kros, tmp_path, motors):
 def test_columns_of_one_name_are_told_apart_and_reserved_names_are_not_taken(kros, tmp_path, motors):
     def folder(name: str, header: str):
         form = {"delimiter": ",", "header": header, "comments": "", "fmt": "%.12g"}
-        for key in motors.episodes[:8]:
+        for key in motors.episodes[:6]:
             path = tmp_path / name / key.unit / f"run_{key.episode}.csv"
             path.parent.mkdir(parents=True, exist_ok=True)
             values = motors.read(key)

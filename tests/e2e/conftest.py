@@ -55,7 +55,7 @@ def low_orders() -> Iterator[None]:
 @contextmanager
 def two_figures() -> Iterator[None]:
     """Reports have two figures, drawn in this process, where studies are about something else: drawing takes longest."""
-    some = ("observers_in_time", "forms")
+    some = ("synthesis", "outlier_scores")
 
     def drawn(name: str, run: RunFolder) -> Drawn:
         return draw(name, run) if name in some else Drawn(name, name, reason="not asked for")

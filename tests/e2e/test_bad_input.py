@@ -55,8 +55,9 @@ def test_missing_study(kros, tmp_path):
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        ("[identify]\nalfa = 90", ("identify.alfa", "unknown key")),
         ("[identify]\nalpha = -1", ("identify.alpha", "-1")),
+        ("[load]\ninertia = nan", ("inertia",)),
+        ("[[lifting.families]]\nkind = 'harmonics'\nangle = 5\nratio = []", ("lifting",)),
         ("[uncertainty]\nform = 'upside_down'", ("uncertainty.form", "upside_down")),
         ("[nonsense]\na = 1", ("nonsense", "unknown key")),
         ("[lifting]\nfunctions = ['sin(positoin)']", ("positoin", "position")),

@@ -137,15 +137,8 @@ def test_an_output_that_is_full_or_gone():
 
 @pytest.mark.parametrize(
     ("content", "word"),
-    [
-        ("a = " + "[" * 5000, "nested"),
-        ("[data]\nsource = 'recordings'\n[identify]\nalpha = inf\n", "alpha"),
-        ("[data]\nsource = 'recordings'\n[load]\ninertia = nan\n", "inertia"),
-        ('[data]\nsource = "a\\u0000b"\n', "NUL"),
-        ("[data]\nsource = 'recordings'\n[[lifting.families]]\nkind = 'harmonics'\nangle = 5\nratio = []\n", "lifting"),
-        ("data = 5\n", "data"),
-    ],
-    ids=range(6),
+    [("a = " + "[" * 5000, "nested"), ('[data]\nsource = "a\\u0000b"\n', "NUL"), ("data = 5\n", "data")],
+    ids=range(3),
 )
 def test_studies_that_cannot_be_used(kros, store, tmp_path, content, word):
     study = store()

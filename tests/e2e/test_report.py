@@ -176,7 +176,7 @@ def test_a_part_of_a_run_has_a_report(tmp_path) -> None:
 
 
 def test_figures_as_files_are_the_same_every_time(demo, tmp_path, monkeypatch) -> None:
-    few = ("phase", "forms")
+    few = ("phase", "outlier_scores")
     monkeypatch.setattr("kros.report.files.FIGURES", {name: FIGURES[name] for name in few})
     files = []
     for folder in (tmp_path / "new" / "a", tmp_path / "new" / "b"):

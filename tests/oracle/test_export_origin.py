@@ -64,8 +64,8 @@ def test_the_direction_leaves_the_model_where_it_is(kind):
 def test_a_machine_that_turns_on_and_on(kind, tmp_path):
     """Batches, sample by sample and in C, with samples that are lost."""
     observer = KINDS[kind]()
-    y, u = far_away(900, 1500, on=100)
-    u[700:720], y[900, 1], y[1200:1250] = np.nan, np.nan, np.nan
+    y, u = far_away(900, 600, on=40)
+    u[300:320], y[360, 1], y[480:500] = np.nan, np.nan, np.nan
     batch = run_observer(observer, y, u)
     builds = {p: CompiledObserver.build(export_c(observer, tmp_path / p, "drive", p)) for p in ("double", "float")}
     for machine in range(2):

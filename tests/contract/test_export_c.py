@@ -33,9 +33,10 @@ needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compil
 @needs_compiler
 @pytest.mark.parametrize("kind", MACHINES)
 def test_same_estimates_and_the_same_status_under_faults(kind, tmp_path):
-    observer, (y, u) = MACHINES[kind](), samples(400)
+    observer, (y, u) = MACHINES[kind](), samples(800 if "monitor" in kind else 400)
     wanted, status = in_python(observer, y, u)
     assert len(set(status)) >= 4
+    assert (status & SampleStatus.UNCERTIFIED).any() == ("monitor" in kind)
     for precision, close in (("double", 1e-9), ("float", 1e-4))[: 1 + (kind in SINGLE)]:
         folder = export_c(observer, tmp_path / precision, "drive", precision)
         compiled = CompiledObserver.build(folder, flags=(*STRICT, *TRAPPED))

@@ -107,7 +107,7 @@ def test_a_batch_one_machine_and_c_agree(delay, guard, tmp_path):
 def test_a_recording_in_blocks_is_run_as_a_whole(kind, delay, loops, monkeypatch):
     """Gaps across the borders of blocks, restarts, delays, lost inputs, past values, filter banks."""
     y, u = recordings(seed=4)
-    u[180:192] = np.nan  # held, then a new start
+    u[180:192], u[146:152] = np.nan, np.nan  # held, then a new start; the second time over a border
     y[60:75], y[305:330] = np.nan, np.nan
     y[100:170], y[340:] = np.sin(np.arange(70))[:, None, None], 0.5  # where nothing is missing
     if kind == "history":

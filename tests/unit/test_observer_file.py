@@ -140,7 +140,7 @@ def filters(**changes: Any) -> Observer:
     lifting = Lifting(("position", "filter_1", *own), (), (), ("torque",), ("1",))
     ages = ("half", "recovery", "reach", "start_recovery")
     bank = {"filters": 1, "start": np.ones((5, 7)), **dict.fromkeys(ages, np.ones(1))}
-    bank |= dict.fromkeys(ages[:2], np.ones((1, 1)))
+    bank |= {**dict.fromkeys(ages[:2], np.ones((1, 1))), "start_recovery": np.array([0.9, 0.5])}
     none, made = gain(np.zeros((5, 1)), 0.01), FilterBank(**bank | changes)
     return Observer(
         "f", lifting, 0.5 * np.eye(5), np.ones((5, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=made
@@ -159,7 +159,7 @@ def test_a_filter_bank_goes_through_its_file(tmp_path: Path) -> None:
     ("changes", "error", "match"),
     [
         ({"recovery": np.array([[1.5]])}, DataError, "between 0 and 1"),
-        ({"start_recovery": np.array([0.5, 0.5])}, DimensionError, "start_recovery"),
+        ({"start_recovery": np.array([0.5])}, DimensionError, "start_recovery"),
         ({"half": np.zeros((1, 1))}, DataError, "half should be positive"),
         ({"start": np.ones((2, 7))}, DimensionError, "start"),
         ({"filters": 4}, DimensionError, "at most 1 filters of measurements; found .* 4 filters"),

@@ -63,7 +63,7 @@ typedef struct {
     const double *reach;      /* (recorded) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
     const double *bank;       /* (3 kinds + 1, recorded, batch): half, recovery, longest age, recovery of a start */
-    double *gap;              /* (kinds recorded + q + 1 + q filters, batch): age, count, age of the start or the last loss, ramps; moved on */
+    double *gap;              /* (kinds recorded + q + 2 + q filters, batch): age, count, ages of the start and of a loss, ramps; moved on */
     double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
 
@@ -269,7 +269,7 @@ static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg,
             const vec near = clipped(reg[i] - held, -reach, reach);
             const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
-            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(ages + s->q + 1 + j * r + l) * MOST + v] * jump;
+            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(ages + s->q + 2 + j * r + l) * MOST + v] * jump;
             missing[row] = lost;
             reg[i] = y[row] = either(lost, held + near, seen);
         }
@@ -298,7 +298,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
         vec longest = {0}, shortest = (vec){0} + INFINITY;
         for (whole j = 0; j < q; j++) {
             const mask lost = missing[j * MOST + v];
-            vec *count = gap + (ages + j) * MOST + v, *of = gap + (ages + q + 1 + j * r) * MOST + v;
+            vec *count = gap + (ages + j) * MOST + v, *of = gap + (ages + q + 2 + j * r) * MOST + v;
             const int moves = any(lost | (*count > 0.0));
             *count = either(lost, *count + 1.0, (vec){0});
             longest = either(*count > longest, *count, longest);
@@ -315,10 +315,11 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
             }
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
-        vec *start = gap + (ages + q) * MOST + v;
-        *start = either(some & (*start < OLDEST), (vec){0} + OLDEST, *start);
-        const vec begun = level(*start, (vec){0} + 1.0);
+        vec *start = gap + (ages + q) * MOST + v, *loss = start + MOST;
+        *loss = either(some, (vec){0} + OLDEST, *loss);
+        const vec begun = level(either(*start > *loss, *start, *loss), (vec){0} + 1.0);
         *start *= bank[3 * ages * MOST + v];
+        *loss *= bank[(3 * ages + recorded) * MOST + v];
         for (whole k = 0; k < s->kinds; k++) {
             const mask lost = k ? some : all;
             const vec gone = k ? either(all, (vec){0}, longest) : shortest;
@@ -346,8 +347,8 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + q + 1 + q * s->filters : 0;
-    const whole numbers = (3 * s->kinds + 1) * recorded;
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + q + 2 + q * s->filters : 0;
+    const whole numbers = (3 * s->kinds + 2) * recorded;
     vec *bank = vectors(numbers), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;

@@ -20,7 +20,9 @@ have ages, T and :math:`\mu` of their own, and the larger m counts. The estimate
 
 After a start, what happened before is not known; after a loss, filters hold what stood for measurements. There
 :math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start and at every loss,
-which falls as the slowest filter forgets. Limits of the estimates hold before the fallback enters them, so that
+which
+falls as the slowest filter forgets after a start, and so that m is below one percent as soon as no delay reaches back
+to it after a loss. Limits of the estimates hold before the fallback enters them, so that
 little of what is far away is left in long gaps.
 
 A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of
@@ -94,20 +96,20 @@ class Gaps:
         self._A = A[self.filters, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
         self._most = np.where(self.hidden, bank.reach, np.inf)
-        self.take(np.zeros((bank.half.size + q + 1 + q * bank.filters, batch)))
+        self.take(np.zeros((bank.half.size + q + 2 + q * bank.filters, batch)))
 
     def take(self, state: Array) -> None:
-        """Go on from a state whose rows are ages, counts, the age of the start and ramps of all machines."""
+        """Go on from a state whose rows are ages, counts, ages of the start and of a loss, and ramps of all machines."""
         n, q = self.bank.half.size, len(self.measured)
         self.state = state
-        age, self.count, self.start, ramp = np.split(state.T, [n, n + q, n + q + 1], axis=1)
+        age, self.count, self.start, ramp = np.split(state.T, [n, n + q, n + q + 2], axis=1)
         self.age = age.reshape(len(age), *self.bank.half.shape)
         self.ramp = ramp.reshape(len(ramp), q, -1).swapaxes(1, 2)
 
     def begin(self, rows: Any, missing: Flags) -> None:
         """Start some machines at measurements of which some may be missing."""
         self.state[:, rows] = 0.0
-        self.start[rows] = np.where(missing.any(axis=1, keepdims=True), _WAITING, OLDEST)[rows]
+        self.start[rows, 0] = np.where(missing.any(axis=1), _WAITING, OLDEST)[rows]
 
     @property
     def waiting(self) -> Flags:
@@ -151,8 +153,8 @@ class Gaps:
         recovered = np.where(lost, self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
         self.age[...] = np.maximum(recovered, lengths)
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
-        disturbed = np.maximum(self.start, OLDEST * some[:, None])
-        recorded += level(disturbed) * (following[:, self.after_start] - recorded)
+        self.start[some, 1] = OLDEST
+        recorded += level(self.start.max(axis=1, keepdims=True)) * (following[:, self.after_start] - recorded)
         np.clip(recorded, *self.limits, out=recorded)
         recorded += self.hidden * self.share * (fallback - recorded)
         at, reach = self.measured, bank.reach[self.measured]
@@ -162,14 +164,16 @@ class Gaps:
             self.ramp[...] = 0.0
         else:
             self.ramp[...] = np.where(missing[:, None], self._A @ self.ramp + slopes * count[:, None], 0.0)
-        self.count[...], self.start[...] = count, np.where(self.waiting[:, None], 1.0, bank.start_recovery) * disturbed
+        waiting = self.waiting
+        self.count[...], self.start[...] = count, bank.start_recovery * self.start
+        self.start[waiting, 0] = _WAITING
 
     @property
     def job(self) -> Record:
         """What the compiled loop needs of gaps."""
         bank = self.bank
-        start = np.full_like(bank.half[:1], bank.start_recovery[0])
-        rows = np.vstack([bank.half, bank.recovery, longest_age(bank.half), start])
+        starts = np.repeat(bank.start_recovery[:, None], bank.half.shape[1], axis=1)
+        rows = np.vstack([bank.half, bank.recovery, longest_age(bank.half), starts])
         return {
             "recorded": self.recorded,
             "kinds": len(bank.half),

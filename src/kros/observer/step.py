@@ -43,7 +43,7 @@ class Steps:
         if self.gaps is not None and machines.any():
             at = machines[:, None] & self.gaps.bank.of_measurements
             np.copyto(self.x, self.observer.initial(y, self.values, u), where=at)
-            self.gaps.start[machines] = OLDEST
+            self.gaps.start[machines, 0] = OLDEST
 
     def earlier(self, u: Array) -> Array:
         """Return the earlier values, (batch, n_earlier); after a start they equal the present ones."""

@@ -235,7 +235,7 @@ def assembled(
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[:n] for end in design.recordings.ranges)
     ages = np.ones((min(2, len(at)), n))
-    gaps = FilterBank(r, start, ages, np.zeros_like(ages), high - low, np.exp([-1 / slowest]))
+    gaps = FilterBank(r, start, ages, np.zeros_like(ages), high - low, np.exp([-1 / slowest, -5 / bank.delays]))
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from pydantic import ConfigDict
 
-from ..core import Array, ConfigError, DataError, Names, did_you_mean, frozen, limits
+from ..core import Array, ConfigError, DataError, Flags, Names, did_you_mean, frozen, limits
 from .population import Channel, Channels, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 
@@ -257,7 +257,7 @@ class Resample(Step):
         time = recording.times(period_s)
         timed = replace(recording, time_s=time)
         check_increasing(timed)
-        start, stop = longest_stretch(time, self.max_gap_s or GAP * estimate_period(timed))
+        start, stop = longest_stretch(np.diff(time) > (self.max_gap_s or GAP * estimate_period(timed)))
         timed, time = timed.cut(start, stop), time[start:stop]
         median = estimate_period(timed)
         count = (time[-1] - time[0]) / min(self.period_s, median)
@@ -310,9 +310,9 @@ class Differentiate(Step):
         return len(channels) if self.of else [c.role for c in channels].count(Role.STATE)
 
 
-def longest_stretch(time_s: Array, gap_s: float) -> tuple[int, int]:
-    """Return the first sample of the longest stretch in which no step of time is longer than a gap, and its end."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(time_s) > gap_s) + 1, [len(time_s)]])
+def longest_stretch(breaks: Flags) -> tuple[int, int]:
+    """Return the first sample of the longest stretch without a break to the next one, and its end."""
+    edges = np.concatenate([[0], np.flatnonzero(breaks) + 1, [len(breaks) + 1]])
     longest = int(np.diff(edges).argmax())
     return int(edges[longest]), int(edges[longest + 1])
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core import ROUNDING, TINY, Array
 from ..data.recording import CHECK
+from ..data.steps import longest_stretch
 
 
 def moments(values: Array) -> Array:
@@ -25,9 +26,8 @@ def course(values: Array) -> Array:
     """
     shares, far = np.zeros(values.shape[1]), np.ptp(values, axis=0) / 2
     for i, column in enumerate(values.T):
-        ends = np.concatenate([[0], np.flatnonzero(np.diff(column)) + 1, [len(column)]])
-        longest = int(np.diff(ends).argmax())
-        part = values[ends[longest] : ends[longest + 1]]
+        start, stop = longest_stretch(np.diff(column) != 0)
+        part = values[start:stop]
         if (np.ptp(part, axis=0) > far).any():
             shares[i] = len(part) / len(values)
     changes, (low, high) = np.abs(np.diff(values, axis=0)), np.quantile(values, (0.01, 0.99), axis=0)
@@ -114,17 +114,15 @@ def _mirrored(units: Sequence[Array], c: int) -> list[list[list[int]]]:
     """
     sizes = [_sizes(G) for G in units]
     least = np.median(np.concatenate(sizes), axis=0) / CHECK.ratio  # what moves less than that may be noise
-    correlations = [
-        np.where((size > least)[:, :, None] & (size > least)[:, None], G / size[:, :, None] / size[:, None], 0.0)
-        for G, size in zip(units, sizes, strict=True)
-    ]
+    scales = [np.where(size > least, size, np.inf) for size in sizes]
+    correlations = [G / scale[:, :, None] / scale[:, None] for G, scale in zip(units, scales, strict=True)]
     sign = np.sign(np.median([np.median(r, axis=0) for r in correlations], axis=0))
     signed = [r * sign for r in correlations]
     usual = np.median([(r > CHECK.correlation).mean(axis=0) for r in signed], axis=0) >= CHECK.usual
-    usual &= np.arange(2 * c)[:, None] % c != np.arange(2 * c) % c
+    usual &= np.tile(np.eye(c) == 0, (2, 2))  # of two channels
     channels = []
     for r in signed:
-        changed = np.where(usual, (r < -CHECK.correlation) * 1.0 - (r > CHECK.correlation), 0.0)
+        changed = usual * ((r < -CHECK.correlation) * 1.0 - (r > CHECK.correlation))
         excess = changed.sum(axis=2).reshape(-1, 2, c).sum(axis=1)
         channels.append([np.flatnonzero((of > 0) & (of == of.max())).tolist() for of in excess])
     return channels

@@ -75,7 +75,7 @@ def _look(population: Population) -> list[EpisodeLook]:
                 period = typical_period(time)
                 deviation = np.abs(np.diff(time) / period - 1)
             usable_s = np.asarray(recording.usable(period).time_s)
-            start, stop = longest_stretch(usable_s, GAP * period)
+            start, stop = longest_stretch(np.diff(usable_s) > GAP * period)
             whole = usable(values).all(axis=1)
             check_episode(values, key, population.columns, gaps=bool(whole.any()))
             looks[key] = EpisodeLook(

@@ -31,7 +31,7 @@ def population(units: tuple[str, ...] = ("a", "b"), **changes: Any) -> Populatio
         for j, c in enumerate(("cold", "warm"))
         for e in range(3)
     }
-    facts = [Unit(units[0], "outliers", {"built": "2022-09-15", "mass": 1.5})]
+    facts = [Unit(units[0], "outliers")]
     return from_arrays(
         {**episodes, **changes}, CHANNELS, 0.01, units=facts, metadata={"plant": "test", "gear_ratio": 100}
     )

@@ -90,7 +90,6 @@ class Unit:
 
     id: str
     group: str = ""
-    metadata: ByName = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def from_arrays(
     measured : sequence of str
         The states that a running observer will be given.
     units : iterable of Unit
-        Group and metadata, where known.
+        Groups, where known.
     metadata : mapping, optional
         Facts about the batch.
 

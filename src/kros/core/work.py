@@ -108,14 +108,14 @@ class Work:
         tasks: Iterable[Any],
         marks: Iterable[str | None],
         kind: Any = Any,
-        usable: Callable[[Any, Any], bool] = lambda task, result: True,
+        usable: Callable[[Any], bool] = lambda result: True,
     ) -> Iterator[T]:
         """Map a function over tasks, in order, but for results of a kind that are there by digests of tasks."""
         if self.results is None:
             yield from self.map(title, function, tasks)
             return
         pairs = [(self.results.place(function, mark), task) for mark, task in zip(marks, tasks, strict=True)]
-        earlier = [_read(path, kind, partial(usable, task)) for path, task in pairs]
+        earlier = [_read(path, kind, usable) for path, _ in pairs]
         new = [pair for pair, result in zip(pairs, earlier, strict=True) if result is None]
         if new:
             log.info("%s: %d of %d are new or changed", title, len(new), len(pairs))
@@ -126,7 +126,7 @@ class Work:
 
     def run(self, title: str, work: Iterable[Callable[[], T]]) -> list[T]:
         """Run independent pieces of work, in order."""
-        return list(self.map(title, call, work))
+        return self.begin(title, work)()
 
     def begin(self, title: str, work: Iterable[Callable[[], T]]) -> Callable[[], list[T]]:
         """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""

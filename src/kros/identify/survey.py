@@ -135,7 +135,7 @@ def survey(
     tasks: list[_Task] = [(population.select([u], [c]), folder, chosen.on_nan) for u, c, _ in population.groups()]
     marks = _marks(population.source, (part.episodes for part, *_ in tasks), chosen.on_nan, folder is None)
     recalled = (work or Work()).recall(
-        "read", _read_group, tasks, marks, _GroupFacts, lambda _, known: copy is None or copy.reuse(known)
+        "read", _read_group, tasks, marks, _GroupFacts, lambda known: copy is None or copy.reuse(known)
     )
     groups = list(recalled)
     if folder is None:

@@ -95,7 +95,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     common = refine_pooled(start, one_model)
     pooled = problem.matrices(common)
     prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
-    problem = replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
+    problem = replace(problem, sigma=normalised(one_model, common[None]), edged=True, prior=prior)
     path, scores = _path(data, problem, common)
     choice = _choose(scores, options)
     strength = options.strengths[choice]
@@ -176,7 +176,7 @@ def refine_pooled(V: Array, problem: RefinementProblem) -> Array:
             f"Refinement of the pooled model: free runs over {options.horizons[-1]} samples diverge or the model is "
             "unstable; omit lifting functions that grow, or set identify.refine = false."
         )
-    edged = replace(problem, sigma=normalised(few, inside).sigma, edged=True)
+    edged = replace(problem, sigma=normalised(few, inside), edged=True)
     return options.search.minimise(edged.evaluate, edged.admissible, inside).V[0]
 
 
@@ -199,11 +199,10 @@ def _stable_end(V: Array, problem: RefinementProblem) -> Array | None:
     return V if problem.admissible(V).all() else None
 
 
-def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
-    """Return the problem with errors in units of those of a pooled model V, and with a soft edge of stability."""
-    normal, least = problem.run(V), problem.options.least_error
-    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, least**2))
-    return replace(problem, sigma=problem.sigma * size, edged=True)
+def normalised(problem: RefinementProblem, V: Array) -> Array:
+    """Return the sizes of errors with which those of a pooled model V are one on average."""
+    mean_square = float(problem.run(V).cost.mean()) / problem.residuals
+    return problem.sigma * max(np.sqrt(mean_square), problem.options.least_error)
 
 
 def _whitening(R11: Array, n_samples: int) -> Array:

@@ -126,7 +126,7 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
     constant = np.abs(np.diff(reference, prepend=reference[:1])) < spec.steady * top / len(reference)
     steady = constant & (np.abs(reference) > spec.least_speed * top)
     per_reference = _speed_per_reference(angle, reference / top, steady) / (dt * top)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
+    edges = np.flatnonzero(np.diff(steady, prepend=False, append=False))
     segments = []
     for start, stop in zip(edges[::2] + round(spec.settle * len(reference)), edges[1::2], strict=True):
         speed = per_reference * float(np.mean(reference[start:stop])) if stop > start else 0.0

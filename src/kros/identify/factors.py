@@ -150,12 +150,10 @@ def _widened(
     peak: Array, separation: FormulaSeparation, parameters: dict[str, Array], functions: bool
 ) -> tuple[Array, Array]:
     """Return columns of signals, and of functions if asked, in terms of signals and basis; and bounds of magnitudes."""
-    n, p = peak.shape[-1] - len(separation.basis), len(separation.terms) if functions else 0
-    change = np.zeros((*peak.shape, n + p))
+    n = peak.shape[-1] - len(separation.basis)
+    M = separation.matrix(parameters) if functions else np.zeros((0, len(separation.basis)))
+    change = np.zeros((*peak.shape, n + M.shape[-2]))
     change[..., range(n), range(n)] = 1.0
-    if not functions:
-        return change, peak[..., :n]
-    M = separation.matrix(parameters)
     change[..., n:, n:] = np.swapaxes(M, -1, -2)
     return change, np.concatenate([peak[..., :n], np.einsum("...ij,...j->...i", np.abs(M), peak[..., n:])], axis=-1)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -47,7 +47,7 @@ class ModelSet(Shown, Storable):
     input_scale: Array  # (m,)
     alpha: float | None = None  # Tikhonov coefficient, where there is one
     alpha_in_ranges: bool = False  # whether alpha is for channels divided by the ranges or for the recordings' units
-    status: Names = field(default=())  # per unit ``ok``, or what is wrong
+    status: Names = ()  # per unit ``ok``, or what is wrong
     longest_s: float | None = None  # longest episode, below whose inverse the models know no frequency, where known
 
     def _summary_rows(self) -> Record:

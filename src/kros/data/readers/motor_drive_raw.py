@@ -52,8 +52,14 @@ MAPPING = CsvMapping(
     metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
 )
 
-HEADER = ["time_s", "position_deg", "velocity_deg_per_s", "torque_percent", "target_position_deg"]
-HEADER.append("target_velocity_deg_per_s")
+HEADER = [
+    "time_s",
+    "position_deg",
+    "velocity_deg_per_s",
+    "torque_percent",
+    "target_position_deg",
+    "target_velocity_deg_per_s",
+]
 
 
 def find_root(source: Path) -> Path | None:

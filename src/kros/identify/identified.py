@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 from urllib.parse import quote
 
 import numpy as np
@@ -19,26 +18,7 @@ from .factors import Factor
 from .model_set import ModelSet, kinds_for
 from .survey import RecordingFacts
 
-T = TypeVar("T")
 _KIND = "models"
-
-
-class Stored(Mapping[str, T]):
-    """Results in a folder, each loaded when it is asked for and then kept."""
-
-    def __init__(self, load: Callable[[Path], T], places: Mapping[str, Path]) -> None:
-        self._load, self._places, self._known = load, dict(places), dict[str, T]()
-
-    def __getitem__(self, name: str) -> T:
-        if name not in self._known:
-            self._known[name] = self._load(self._places[name])
-        return self._known[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
-
-    def __len__(self) -> int:
-        return len(self._places)
 
 
 @frozen
@@ -152,7 +132,7 @@ class IdentifiedModels(Shown):
     @classmethod
     @loader
     def load(cls, folder: Path) -> IdentifiedModels:
-        """Read what `save` wrote, or a run folder; models and factors are read when they are asked for."""
+        """Read what `save` wrote, or a run folder."""
         folder = Path(folder)
         facts = RecordingFacts.load(folder / "population")
         return cls.load_models(folder, recordings_of(folder).select(facts.groups), facts)
@@ -161,9 +141,8 @@ class IdentifiedModels(Shown):
     def load_models(cls, folder: Path, population: Population, facts: RecordingFacts) -> IdentifiedModels:
         """Read what `save_models` wrote, of recordings that are open already."""
         content, _ = load_artifact(folder / "models", _KIND)
-        sets = Stored(ModelSet.load, {place: folder / "models" / place for place in content["sets"]})
-        places = {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]}
-        factors = Stored(EpisodeFactors.load, places)
+        sets = {place: ModelSet.load(folder / "models" / place) for place in content["sets"]}
+        factors = {c: EpisodeFactors.load(folder / "factors" / quote(c, safe="")) for c in content["conditions"]}
         lifting = sets[content["kinds"][0]].lifting
         calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None
         return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors)

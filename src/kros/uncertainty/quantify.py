@@ -20,7 +20,7 @@ from ..core.artifacts import load_artifact, loader, read_json, save_artifact, wr
 from ..core.linalg import sigma_max
 from ..data import Shown
 from ..identify import ModelSet
-from ..identify.identified import IdentifiedModels, Stored
+from ..identify.identified import IdentifiedModels
 from .bounded import Options, bound_responses, bound_systems, choose_nominal, read_response_data
 from .forms import Form, as_form, residual
 from .model import UncertainModel
@@ -89,8 +89,8 @@ class UncertainModels(Shown):
     def load_sets(cls, folder: Path, models: IdentifiedModels) -> UncertainModels:
         """Read what `save_sets` wrote, of models that are there already."""
         content, _ = load_artifact(folder / "uncertainty", _KIND)
-        sets = Stored(UncertainModel.load, {kind: folder / "uncertainty" / kind for kind in content["kinds"]})
-        outliers = Stored(OutlierModel.load, {place: folder / "outliers" / place for place in content["outliers"]})
+        sets = {kind: UncertainModel.load(folder / "uncertainty" / kind) for kind in content["kinds"]}
+        outliers = {place: OutlierModel.load(folder / "outliers" / place) for place in content["outliers"]}
         scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
         return cls(models, content["nominal"], content["worst_off_nominal"], sets, scores, outliers)
 

@@ -43,12 +43,17 @@ def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> lis
     spans = high - low
     held = (shares > CHECK.held) & (shares > CHECK.ratio * np.median(shares, axis=0))
     size = np.maximum(spans, np.median(spans, axis=0))
-    found = [
-        (i, k, f"stays the same for {100 * shares[i, k]:.0f} % of it while others move") for i, k in np.argwhere(held)
+    far, advice = (jumps > CHECK.jump * size) & (size > 0), "if its sensor failed, leave it out."
+    texts = [
+        f"{episodes[i]}: {channels[k]} stays the same for {100 * shares[i, k]:.0f} % of it "
+        f"while others move; {advice}"
+        for i, k in np.argwhere(held)
     ]
-    far = np.argwhere((jumps > CHECK.jump * size) & (size > 0))
-    found += [(i, k, f"jumps by {jumps[i, k] / size[i, k]:.3g} times its range between two samples") for i, k in far]
-    texts = [f"{episodes[i]}: {channels[k]} {what}; if its sensor failed, leave it out." for i, k, what in found]
+    texts += [
+        f"{episodes[i]}: {channels[k]} jumps by {jumps[i, k] / size[i, k]:.3g} times its range "
+        f"between two samples; {advice}"
+        for i, k in np.argwhere(far)
+    ]
     turns = [(np.abs(jumps - turn) <= steps) & (steps < CHECK.turn * turn) for turn in (2 * np.pi, 360.0)]
     wrapped = np.any(turns, axis=0) & (spans <= jumps + steps)
     for channel, of in zip(channels, wrapped.T, strict=True):

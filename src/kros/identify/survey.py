@@ -53,14 +53,13 @@ class RecordingFacts(Storable):
 
     def keys(self, part: str, unit: str | None = None, condition: str | None = None) -> Keys:
         """Return the episodes of a part, ``train`` or ``test``, of a unit, a condition or both."""
-        keys: Sequence[EpisodeKey] = getattr(self, part) if unit is None else self._by_unit.get((part, unit), ())
+        keys: Sequence[EpisodeKey] = getattr(self, part) if unit is None else self._by_unit[part].get(unit, ())
         return tuple(k for k in keys if condition in (None, k.condition))
 
     @cached_property
-    def _by_unit(self) -> dict[tuple[str, str], list[EpisodeKey]]:
+    def _by_unit(self) -> dict[str, dict[str, list[EpisodeKey]]]:
         """Episodes by part and unit."""
-        parts = {part: grouped(getattr(self, part), lambda key: key.unit) for part in _PARTS}
-        return {(part, unit): keys for part, of in parts.items() for unit, keys in of.items()}
+        return {part: grouped(getattr(self, part), lambda key: key.unit) for part in _PARTS}
 
     def mark(self, task: tuple[Population, Sequence[EpisodeKey], Any]) -> str:
         """Return a digest of what a result follows from: samples and channels of episodes, and how they are used."""

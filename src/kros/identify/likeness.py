@@ -45,8 +45,7 @@ def odd(episodes: Sequence[str], channels: Sequence[str], courses: Array) -> lis
     size = np.maximum(spans, np.median(spans, axis=0))
     far, advice = (jumps > CHECK.jump * size) & (size > 0), "if its sensor failed, leave it out."
     texts = [
-        f"{episodes[i]}: {channels[k]} stays the same for {100 * shares[i, k]:.0f} % of it "
-        f"while others move; {advice}"
+        f"{episodes[i]}: {channels[k]} stays the same for {100 * shares[i, k]:.0f} % of it while others move; {advice}"
         for i, k in np.argwhere(held)
     ]
     texts += [

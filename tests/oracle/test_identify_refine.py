@@ -78,7 +78,7 @@ def test_gradient_of_barrier_and_prior_is_that_of_finite_differences() -> None:
     W = np.array([[[0.95, 0.2, 0.3], [-0.2, 0.93, 1.0]]]) + 0.01 * rng.normal(size=(1, 2, 3))
     V = np.linalg.solve(T, np.swapaxes(W, 1, 2)).swapaxes(1, 2)
     square = np.array([[[0.5, 0.1, 0.3, 0.2], [-0.2, 0.6, 0.1, 1.0]]])
-    prior = ResponsePrior(square[0, :, :2], square[0, :, 2:], np.eye(4), level=0.3, power=2)
+    prior = ResponsePrior(square[0, :, :2], square[0, :, 2:], np.eye(4), level=0.3)
     cases = [(lambda V: stability_barrier(V, T, 0.2, 3.0), V), (prior.normal, square * 1.03)]
     for evaluate, at in cases:
         numeric = np.zeros(at.size)

@@ -4,9 +4,9 @@ In channels divided by their ranges E is the residual of the inverse input multi
 as nominal:
 
     E = G^+ (G - G0),      G = Phi B,  Phi = (zI - A)^-1,      dE = (G^+ Phi) dW Z (I - E),  Z = [G; I]
-    cost = N strength level^2 mean over frequency of [(1 + e)^power - 1] / power,      e = (||E||_F / level)^2
+    cost = N strength level^2 mean over frequency of (e + e^2 / 2),      e = (||E||_F / level)^2
 
-which is quadratic below `level`; a power above one flattens the residual's peak, which is what a weight has to cover.
+which is quadratic below `level`; the square of e flattens the residual's peak, which is what a weight has to cover.
 `dE` neglects how the range of G turns, which is of second order.
 
 Exact search for the candidate whose largest residual is smallest, without visiting all pairs.
@@ -69,7 +69,6 @@ class ResponsePrior:
     B: Array  # (n, m)
     T: Array  # (n + m, n + m)
     level: float
-    power: int
     weight: float = 1.0
     points: int = 100
 
@@ -91,7 +90,7 @@ class ResponsePrior:
         """Return ``[J r]^T [J r]`` with r = -E, weighted for the gradient of the cost; shape (unit, P + 1, P + 1)."""
         E, a, Z = self.residual(V)
         size = np.sum(np.abs(E) ** 2, axis=(-1, -2)) / self.level**2  # (unit, frequency)
-        slope = self.weight * (1 + size) ** (self.power - 1) / size.shape[1]
+        slope = self.weight * (1 + size) / size.shape[1]
         units, rows, columns = V.shape
         by_row = (adjoint(a) @ a) * slope[..., None, None]
         by_column = Z.conj() @ np.swapaxes(Z, -1, -2)
@@ -100,7 +99,7 @@ class ResponsePrior:
         H = form.transpose(0, 1, 3, 2, 4).reshape(units, rows * columns, -1)
         pull = adjoint(a) @ (E * slope[..., None, None]) @ adjoint(Z)
         g = -pull.real.sum(axis=1).reshape(units, -1)
-        cost = self.weight * self.level**2 * np.mean(((1 + size) ** self.power - 1) / self.power, axis=1)
+        cost = self.weight * self.level**2 * np.mean(size + size**2 / 2, axis=1)
         return np.block([[H, g[..., None]], [g[:, None], cost[:, None, None]]])
 
 

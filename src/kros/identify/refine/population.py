@@ -94,7 +94,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     one_model = problem.of_one_model(data.rows)
     common = refine_pooled(start, one_model)
     pooled = problem.matrices(common)
-    prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
+    prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level)
     problem = replace(problem, sigma=normalised(one_model, common[None]), edged=True, prior=prior)
     path, scores = _path(data, problem, common)
     choice = _choose(scores, options)

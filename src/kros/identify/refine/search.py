@@ -133,8 +133,7 @@ class RefineOptions:
     bound: float = 10.0  # largest value of a free run on training episodes
 
     # Prior
-    prior_level: float = 0.3  # residual up to which the prior is quadratic
-    prior_power: int = 2  # beyond the level, which flattens the residual's peak
+    prior_level: float = 0.3  # residual up to which the prior is quadratic; beyond it flattens the residual's peak
     strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)  # strongest first
     patience: int = 3  # strengths over which the held-out error must fall by half of the tolerance
     tolerance: float = 0.1  # the strongest prior whose held-out error exceeds the lowest by at most this is chosen

@@ -33,6 +33,7 @@ _ROLE_OF, _ROLE_OF_STATE = (
 _MEASURE = re.compile(
     r"^\d+(?:[.,]\d+)?(?:bar|mbar|psi|kpa|degc|°c|c|k|kg|g|n|nm|v|a|rpm|hz|mm|m|percent|pct|%)$", re.IGNORECASE
 )
+_ENDING = re.compile(f"(?:{'|'.join(map(re.escape, ENDINGS))})$", re.IGNORECASE)
 _DATE = re.compile(r"^(?:19|20)\d{6}(?:T?\d{4,6})?$")
 _DATE_PARTS = (r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*")  # 2024-05-31
 Roles = list[str | None]
@@ -41,9 +42,8 @@ Cut = list[list[str]]  # words of every path, with what is between them
 
 def infer_names(paths: Sequence[str]) -> tuple[str, str | None]:
     """Return the expression that tells files apart, and one for episodes of one unit where names do not say which."""
-    ends = [next((ending for ending in ENDINGS if p.lower().endswith(ending)), "") for p in paths]
-    stems = [p[: len(p) - len(ending)] for p, ending in zip(paths, ends, strict=True)]
-    endings = sorted({re.escape(p[len(stem) :]) for p, stem in zip(paths, stems, strict=True)})
+    stems = [_ENDING.sub("", p) for p in paths]
+    endings = sorted({re.escape(p.removeprefix(stem)) for p, stem in zip(paths, stems, strict=True)})
     ending = endings[0] if len(endings) == 1 else f"(?:{'|'.join(endings)})"
     if cut := _cut(stems):
         columns = list(zip(*(p[::2] for p in cut), strict=True))

@@ -45,7 +45,7 @@ def _bounds(expression: Any, box: Box) -> tuple[float, float]:
 
 
 def _range(name: str, value: Any) -> tuple[float, float]:
-    low, high = (float(v) for v in (value if np.ndim(value) else (value, value)))
+    low, high = map(float, np.broadcast_to(value, 2))
     if not low <= high:
         raise ConfigError(f"Bounds: the range of {name!r} is [{low:g}, {high:g}]; give the lower number first.")
     return low, high

@@ -85,10 +85,9 @@ def read_motor_drive_raw(source: Path) -> Population:
     if strange is not None:
         raise DataError(f"{what}: file {root / strange} should be named <time>_<serial>_<load|noload>/*_<episode>.csv.")
     population = read_csv_folder(root, MAPPING)
-    steps = ((scale, population.sample_period_s * scale) for scale in (1e-3, 1e-6))
-    scale = next((scale for scale, step in steps if math.isclose(step, PERIOD_S, rel_tol=0.01)), None)
-    if scale is not None:
-        population = read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
+    for scale in (1e-3, 1e-6):
+        if math.isclose(population.sample_period_s * scale, PERIOD_S, rel_tol=0.01):
+            population = read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
     return prepare(population, STEPS)
 
 

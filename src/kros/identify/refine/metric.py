@@ -110,8 +110,6 @@ def peak_residual(A: Array, B: Array, points: int = 200) -> float:
     z = unit_circle(points)
     G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
     inverse, G, every = entries_first(np.linalg.pinv(G)), entries_first(G), np.arange(points)  # (m, n, unit, frequency)
-    if np.array_equal(G, np.broadcast_to(G[:, :, :1], G.shape)):
-        return 0.0
 
     def size(nominal: AnyArray, unit: AnyArray) -> AnyArray:
         return sigma_max_first(multiply(inverse[:, :, unit, every], G[:, :, nominal, every] - G[:, :, unit, every]))

@@ -85,12 +85,11 @@ class _Run:
     def rows(self, window: Array) -> Iterator[Array]:
         """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from a window on."""
         n, p, batch = self.W.shape
-        lifting, window_of = self.lifting, self.lifting.window
-        read = {name for formula in (*lifting.formulas, *lifting.input_formulas) for name in formula.used}
-        past = [  # earlier values of states that a formula reads: entry of the window, state and delay
+        lifting = self.lifting
+        past = [  # earlier values of states: entry of the window, state and delay
             (entry, lifting.states.index(quantity), delay)
-            for entry, (quantity, delay) in enumerate(window_of.quantities)
-            if delay and window_of.names[entry] in read and quantity in lifting.states
+            for entry, (quantity, delay) in enumerate(lifting.window.quantities)
+            if delay and quantity in lifting.states
         ]
         depth = 2 + max((d for _, _, d in past), default=0)  # now, earlier, and space for the next
         S = np.zeros((depth, n, n * p, batch))

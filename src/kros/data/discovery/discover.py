@@ -140,11 +140,9 @@ def _columns(
         time, keys, notes = _time(source, head, columns, candidates, samples)
         known[time.at] = replace(time, part=ColumnPart.TIME)
     keys |= {"labels": labels} if labels else {}
-    for column in columns:
-        if column.header in labels.values():
-            known[column.at] = replace(column, why="says which unit, condition or episode a row belongs to")
-    proposed = propose([c for c in numeric if c.at not in known], samples)
-    known = {c.at: c for c in proposed} | known
+    why = "says which unit, condition or episode a row belongs to"
+    known |= {c.at: replace(c, why=why) for c in columns if c.header in labels.values()}
+    known |= {c.at: c for c in propose([c for c in numeric if c.at not in known], samples)}
     return [known.get(c.at, replace(c, why="no numbers")) for c in columns], keys, notes
 
 

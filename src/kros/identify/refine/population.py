@@ -79,8 +79,7 @@ def refine_population(
     ((2, 3, 3), True)
     """
     marks = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
-    values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters if name in parameters}
-    data = TrainingData(population, keys, lifting, values, factor, marks)
+    data = TrainingData(population, keys, lifting, parameters, factor, marks)
     ranges = Ranges.of(factor, lifting.n_lifted, marks)
     return ranges.restore(_refine(data.divided_by(ranges), options or RefineOptions()))
 

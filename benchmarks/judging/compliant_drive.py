@@ -234,7 +234,9 @@ def simulate(
     keys = [EpisodeKey(u, c, str(e)) for u in units for c in sorted(conditions) for e in range(n_episodes)]
     rows = np.repeat(np.arange(n_units), len(conditions) * n_episodes)
     parameters = draw(seed, n_units, spread)
-    references = [SPEED * np.stack(episode_reference(seed, e, n_samples, REST_SAMPLES)) for e in range(n_episodes)]
+    seeds = (np.random.SeedSequence(seed, spawn_key=(0, e)) for e in range(n_episodes))
+    streams = map(np.random.default_rng, seeds)
+    references = [SPEED * np.stack(episode_reference(rng, n_samples, REST_SAMPLES)) for rng in streams]
     targets = np.stack([references[int(k.episode)] for k in keys], axis=1)
     loaded = np.array([float(k.condition == "load") for k in keys])
     signals = run({name: value[rows] for name, value in parameters.items()}, loaded, targets, limit)[..., REST_SAMPLES:]

@@ -15,7 +15,17 @@ from ...core import AnyArray, Array, ConfigError, Flags, Names, Record, frozen
 from ...data import Channel, EpisodeKey, Role, prepare
 from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
-from ..batch import OUTLIER_STREAM, POSITION, VELOCITY, BatchSettings, SimulatedEpisodes, SimulatedPopulation, by_unit
+from ..batch import (
+    INPUT_STREAM,
+    NOISE_STREAM,
+    OUTLIER_STREAM,
+    POSITION,
+    VELOCITY,
+    BatchSettings,
+    SimulatedEpisodes,
+    SimulatedPopulation,
+    by_unit,
+)
 from .dynamics import (
     CURRENT_NOISE,
     GAINS,
@@ -30,7 +40,6 @@ from .dynamics import (
     simulate,
 )
 
-REFERENCE_STREAM = 0  # first word of the spawn key
 MAX_SPEED = np.pi  # rad/s: 0.5 rev/s at the output
 ACCELERATION_SAMPLES = 150  # length of the ramps of the trapezoid
 JERK_SAMPLES = 60  # length of the ramps of the acceleration
@@ -44,9 +53,8 @@ _CANDIDATES = 64
 _TRIES = 1000
 
 
-def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int) -> tuple[Array, Array]:
+def episode_reference(rng: np.random.Generator, n_samples: int, n_rest: int) -> tuple[Array, Array]:
     """Return target position and velocity of an episode, each of shape (n_rest + n_samples,), in rad and rad/s."""
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(REFERENCE_STREAM, episode)))
     checkpoints = _draw_checkpoints(rng, n_samples)
     durations = _lengths(checkpoints) + _RAMPS
     spare = n_samples - SETTLE_SAMPLES - durations.sum()  # spread as rests at the checkpoints
@@ -118,7 +126,6 @@ TRUTHS = (Channel("velocity_true", Role.TRUTH, "rad/s", of="velocity"),)
 REST_SAMPLES = 1000
 # As a reader of raw recordings prepares them; undoing the lag of the targets costs it the last sample.
 PREPARATION = (Offset("position", "target_position", 500, 1000), Trim(start=REST_SAMPLES, tail=1))
-RECORDING_STREAM = 3  # first word of the spawn key of noise and offsets
 MAX_OFFSET_RAD = 0.02  # of the measured position, at the gearbox output
 
 
@@ -183,12 +190,13 @@ class HarmonicDrivePopulation(BatchSettings):
         row, condition, episode = np.unravel_index(np.arange(len(keys)), (len(units), len(conditions), self.n_episodes))
         loaded = np.array([c == "load" for c in conditions], float)[condition]
         samples, gains = round(self.seconds / SAMPLE_PERIOD_S) + 1, GAINS[self.loop]
-        inputs = [np.stack(episode_reference(self.seed, e, samples, REST_SAMPLES)) for e in range(self.n_episodes)]
+        streams = (self.random(INPUT_STREAM, e) for e in range(self.n_episodes))
+        inputs = [np.stack(episode_reference(rng, samples, REST_SAMPLES)) for rng in streams]
         position, velocity = np.stack(inputs, axis=1)
         states, true, torque = simulate(parameters.take(row), loaded, episode, (position, velocity), gains)
         parts = {}
         for i, key in enumerate(keys):  # what the recording adds: an offset of the position, noise on the current
-            rng = self.random(RECORDING_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
+            rng = self.random(NOISE_STREAM, int(key.unit), CONDITIONS.index(key.condition), int(key.episode))
             states[i, 0] += rng.uniform(-MAX_OFFSET_RAD, MAX_OFFSET_RAD)
             states[i, 2] += CURRENT_NOISE * rng.standard_normal(states.shape[-1])
             parts[key] = states[i], inputs[episode[i]], true[i]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import math
 import operator
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -184,19 +185,16 @@ class _Reader:
     def _earlier(self, name: str, index: ast.expr) -> Any:
         import sympy as sp
 
-        written = f"{name}[{ast.unparse(index)}]"
+        steps = ast.unparse(index)
+        written = f"{name}[{steps}]"
         if name not in self.delayed:
             known = ", ".join(self.delayed) or "states and inputs"
             raise self._error(f"there is no {written}; only {known} have earlier values.")
-        try:
-            place = ast.literal_eval(index)
-        except ValueError:
-            place = None
-        if type(place) is not int or place >= 0:
+        if not re.fullmatch(r"-[1-9]\d*", steps):
             raise self._error(f"{written} is no earlier value; give a whole number of samples, such as {name}[-1].")
-        if -place > MAX_DELAY:
+        if -int(steps) > MAX_DELAY:
             raise self._error(f"the delay in {written} is too deep; at most {MAX_DELAY} samples are kept.")
-        return sp.Symbol(delayed_name(name, -place), real=True)
+        return sp.Symbol(written, real=True)
 
     def _error(self, problem: str) -> ConfigError:
         return ConfigError(f"Formula {self.text!r}: {problem}")

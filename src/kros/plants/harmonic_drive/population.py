@@ -108,9 +108,10 @@ def _candidates(rng: np.random.Generator, n_moves: int) -> Array:
 
 def _fits(drawn: Array, n_samples: int) -> Flags:
     """Tell which candidates fill the episode without overrunning it and hold full speed in both directions."""
-    lengths, forward, held = _lengths(drawn), np.diff(drawn) > 0, _RAMPS + LEAST_HOLD_SAMPLES
+    lengths, forward = _lengths(drawn), np.diff(drawn) > 0
+    held = lengths >= _RAMPS + LEAST_HOLD_SAMPLES
     total = (lengths + _RAMPS).sum(axis=1) + SETTLE_SAMPLES
-    both = np.any((lengths >= held) & forward, axis=1) & np.any((lengths >= held) & ~forward, axis=1)
+    both = np.any(held & forward, axis=1) & np.any(held & ~forward, axis=1)
     return (total <= n_samples) & (total >= LEAST_IN_MOTION * n_samples) & both
 
 

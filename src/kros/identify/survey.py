@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -153,7 +153,7 @@ def survey(
 def _marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
     """Return digests of all that the samples of every group follow from; None where the recordings are in no file."""
     read = source.recordings
-    settings = [(f.name, getattr(read, f.name)) for f in fields(read) if f.name != "places"]
+    settings = [(name, value) for name, value in vars(read).items() if name != "places"]
     about = (source.channels, source.period_s, source.steps, source.gaps)
     stamp, how = lru_cache(stamp_of), digest_of(about, type(read).__name__, settings, declared)
 

@@ -115,5 +115,5 @@ def read_segments(
 
 def held_segments(count: int, keys: Keys) -> int:
     """Return how many of the segments come from the last episode: its share, at least one where there are two."""
-    typical = int(np.median([len(episodes) for episodes in keys.values()])) if keys else 1
+    typical = int(np.median([len(episodes) for episodes in keys.values()]))
     return min(count - 1, max(1, round(count / max(1, typical)))) if count > 1 else 0

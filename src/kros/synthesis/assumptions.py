@@ -51,16 +51,17 @@ def require(plant: Any, method: str, proper: bool = True) -> None:
         needed = "a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt)"
         raise DimensionError(f"{method} needs {needed}, found {type(plant).__name__}; build one first.")
     p, failed = plant, dict[tuple[str, str], str]()
-    sides = (p.A, p.B2, p.C1, p.D12), (p.A.T, p.C2.T, p.B1.T, p.D21.T)
-    for (A, B, _, D), reached, regular in zip(sides, REACHED, REGULAR, strict=True):
-        if modes := unreachable_modes(A, B, p.dt):
+    sides = p, p.dual
+    for side, reached, regular in zip(sides, REACHED, REGULAR, strict=True):
+        if modes := unreachable_modes(side.A, side.B2, p.dt):
             failed[reached] = f"mode {modes[0]:.6g}"
+        D = side.D12
         if (rank := int(np.linalg.matrix_rank(D, rtol=ITERATED))) < D.shape[1]:
             failed[regular] = f"rank {rank} of {D.shape[1]}"
     if proper and p.dt == 0 and np.any(p.D11):
         failed[PROPER] = f"largest entry {np.abs(p.D11).max():.3g}"
     if not failed:
-        zeros = zip(NO_ZERO, (_boundary_zeros(*side, p.dt) for side in sides), strict=True)
+        zeros = zip(NO_ZERO, map(_boundary_zeros, sides), strict=True)
         failed = {label: f"zero {found[0]:.6g}" for label, found in zeros if found}
     if failed:
         texts = [f"{label} ({value}): {fix}" for (label, fix), value in failed.items()]
@@ -75,8 +76,8 @@ def require_detectable(A: AnyArray, C: AnyArray, dt: float, method: str) -> None
         raise SynthesisError(f"{method}: (A, C) is not detectable, {problem}; measure another state.")
 
 
-def _boundary_zeros(A: AnyArray, B: AnyArray, C: AnyArray, D: AnyArray, dt: float) -> list[complex]:
-    """Zeros on the stability boundary: D of full column rank, eigenvalues of A - B D^+ C that the rest of C sees."""
-    pinv = np.linalg.pinv(D)
-    modes = unreachable_modes((A - B @ pinv @ C).T, (C - D @ (pinv @ C)).T, dt)
-    return [mode for mode in modes if (abs(mode) - 1 if dt > 0 else mode.real / (1 + abs(mode))) < ROUNDING]
+def _boundary_zeros(p: GeneralizedPlant) -> list[complex]:
+    """Zeros on the stability boundary: D12 of full column rank, eigenvalues of A - B2 D12^+ C1 that the rest sees."""
+    solved = np.linalg.pinv(p.D12) @ p.C1
+    modes = unreachable_modes((p.A - p.B2 @ solved).T, (p.C1 - p.D12 @ solved).T, p.dt)
+    return [mode for mode in modes if (abs(mode) - 1 if p.dt > 0 else mode.real / (1 + abs(mode))) < ROUNDING]

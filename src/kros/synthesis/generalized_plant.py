@@ -135,6 +135,12 @@ class GeneralizedPlant:
         """The plant of channel 2 alone, from w2 to z2."""
         return self.channel(self.rows(2), self.columns(2))
 
+    @property
+    def dual(self) -> GeneralizedPlant:
+        """The transposed plant: z and w change places, and so do y and u."""
+        p = self
+        return GeneralizedPlant(p.A.T, p.C1.T, p.C2.T, p.B1.T, p.B2.T, p.D11.T, p.D21.T, p.D12.T, p.D22.T, p.dt)
+
     def open_loop(self) -> StateSpace:
         """Return the plant as one system from (w, u) to (z, y)."""
         D = np.block([[self.D11, self.D12], [self.D21, self.D22]])

@@ -109,8 +109,10 @@ def _doubling(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray) -
 
 def riccati_pair(p: GeneralizedPlant, method: str) -> tuple[AnyArray, AnyArray]:
     """Return the solutions of the control and filter Riccati equations of a plant's H2 problem."""
-    X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, f"{method}, control")
-    Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, p.D21 @ p.D21.T, p.B1 @ p.D21.T, p.dt, f"{method}, filter")
+    X, Y = (
+        solve_riccati(s.A, s.B2, s.C1.T @ s.C1, s.D12.T @ s.D12, s.C1.T @ s.D12, s.dt, f"{method}, {side}")
+        for side, s in (("control", p), ("filter", p.dual))
+    )
     return X, Y
 
 

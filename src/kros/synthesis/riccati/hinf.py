@@ -145,27 +145,24 @@ def frequency_bound(p: GeneralizedPlant) -> float:
     """Return the largest bound of the frequencies around all poles, searched for around the largest."""
     from scipy.linalg import null_space
 
-    sides = (p.A, p.B1, p.C1, p.D11, p.C2, p.D21), (p.A.T, p.C1.T, p.B1.T, p.D11.T, p.B2.T, p.D12.T)
     best = 0.0
-    for side in sides:
-        A, _, _, D, _, D_y = side
-        free = null_space(D_y)
+    for side in (p, p.dual):
+        D, free = side.D11, null_space(side.D21)
         best = max(best, float(np.linalg.norm(D @ free, 2)) if D.size and free.size else 0.0)
-        if len(A) and D.size:
-            bounds, points = partial(_bounds, side, p.dt), _grid(A, p.dt)
+        if len(p.A) and D.size:
+            bounds, points = partial(_bounds, side), _grid(side.A, p.dt)
             best = max(best, sharpened(bounds, points, bounds(points))[1])
     return best
 
 
-def _bounds(side: tuple[AnyArray, ...], dt: float, rad: AnyArray) -> AnyArray:
+def _bounds(p: GeneralizedPlant, rad: AnyArray) -> AnyArray:
     """Return the bounds at frequencies, rad/s, in discrete time rad per sample."""
-    A, B, C, D, C_y, D_y = side
-    n, m, q = len(A), B.shape[1], len(C_y)
+    n, m, _, _, q = p.sizes
     # z - 1 keeps the digits at low frequency, where z and A are both close to one.
-    point, shifted = (np.expm1(1j * rad), A - np.eye(n)) if dt > 0 else (1j * rad, A)
+    point, shifted = (np.expm1(1j * rad), p.A - np.eye(n)) if p.dt > 0 else (1j * rad, p.A)
     system = np.zeros((len(rad), n + q, n + m), complex)
     system[:, :n, :n] = point[:, None, None] * np.eye(n) - shifted
-    system[:, :n, n:], system[:, n:, :n], system[:, n:, n:] = -B, C_y, D_y
+    system[:, :n, n:], system[:, n:, :n], system[:, n:, n:] = -p.B1, p.C2, p.D21
     size = np.linalg.norm(system, axis=2, keepdims=True)
     _, values, Vh = np.linalg.svd(system / np.where(size > 0, size, 1.0))
     # Constraints that only rounding tells from others are none: without an effect of K on z the kernel is larger.
@@ -176,7 +173,7 @@ def _bounds(side: tuple[AnyArray, ...], dt: float, rad: AnyArray) -> AnyArray:
     _, values, Vh = np.linalg.svd(kernel[:, n:])
     inverse = np.where(values > _RANK, 1 / np.maximum(values, _RANK), 0.0)
     signals = kernel @ adjoint(Vh[:, : values.shape[1]]) * inverse[:, None, :]
-    bounds = np.linalg.norm(C @ signals[:, :n] + D @ signals[:, n:], 2, axis=(-2, -1))
+    bounds = np.linalg.norm(p.C1 @ signals[:, :n] + p.D11 @ signals[:, n:], 2, axis=(-2, -1))
     return bounds * (1 - 100 * (n + m) * EPS * np.maximum(inverse.max(axis=1), 1.0))
 
 

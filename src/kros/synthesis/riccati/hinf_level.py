@@ -73,8 +73,8 @@ class Frame:
         """Return the central controller of a level, if there is one, and whether its conditions clearly fail."""
         p = self.normal
         try:
-            X, F = _half(p.A, p.B1, p.B2, p.C1, p.D11, p.D12, gamma)
-            Y, L = _half(p.A.T, p.C1.T, p.C2.T, p.B1.T, p.D11.T, p.D21.T, gamma)
+            X, F = _half(p, gamma)
+            Y, L = _half(p.dual, gamma)
             radius = float(spectral_radius(Y @ X)) / gamma**2
             if min(_lowest(X, _size(p.A, p.C1)), _lowest(Y, _size(p.A, p.B1))) < -_DOUBT or radius > 1 + _DOUBT:
                 return None, True
@@ -90,14 +90,13 @@ class Frame:
         return absorb_feedthrough(absorb_feedthrough(K, self.D22), self.given.D22)
 
 
-def _half(
-    A: AnyArray, B1: AnyArray, B2: AnyArray, C: AnyArray, D1: AnyArray, D2: AnyArray, gamma: float
-) -> tuple[AnyArray, AnyArray]:
+def _half(p: GeneralizedPlant, gamma: float) -> tuple[AnyArray, AnyArray]:
     """Stabilising solution X of ``x' = A x + B1 w + B2 u``, cost ``z'z - gamma^2 w'w``, and its feedback of (w, u)."""
     from scipy.linalg import schur
 
-    n, B, D = len(A), np.hstack([B1, B2]), np.hstack([D1, D2])
-    R = D.T @ D - gamma**2 * np.diag(np.arange(D.shape[1]) < D1.shape[1])
+    A, B, C, D = p.A, np.hstack([p.B1, p.B2]), p.C1, np.hstack([p.D11, p.D12])
+    n, n_w, *_ = p.sizes
+    R = D.T @ D - gamma**2 * np.diag(np.arange(D.shape[1]) < n_w)
     solved = np.linalg.solve(R, np.hstack([D.T @ C, B.T]))
     closed, quadratic, cost = A - B @ solved[:, :n], B @ solved[:, n:], C.T @ C - C.T @ D @ solved[:, :n]
     # Units of the costate level the blocks: rounding is relative to both.

@@ -102,9 +102,9 @@ class GeneralizedPlant:
 
     def channel(self, rows: slice | AnyArray, columns: slice | AnyArray) -> GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""
-        C1, D12, D11 = self.C1[rows], self.D12[rows], self.D11[rows][:, columns]
-        B1, D21 = self.B1[:, columns], self.D21[:, columns]
-        return GeneralizedPlant(self.A, B1, self.B2, C1, self.C2, D11, D12, D21, self.D22, self.dt)
+        _, n_w, _, n_z, _ = self.sizes
+        whole = replace(self, n_w1=None, n_z1=None)
+        return whole.transformed(z=np.eye(n_z)[rows], w=np.eye(n_w)[:, columns])
 
     def transformed(
         self,

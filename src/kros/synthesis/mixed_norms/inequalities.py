@@ -133,8 +133,8 @@ class MixedInequalities:
         )
         Wt = W.swapaxes(-1, -2)
         blocks = [G - _MARGIN * np.eye(2 * n)]
-        for channel in (1, 2):
-            B, C, D = self._channel(channel, v, scale)
+        for channel, part in enumerate((p.performance, p.uncertainty), 1):
+            B, C, D = _channel(part, v, scale)
             Bt, Ct, Dt, one = (m.swapaxes(-1, -2) for m in (B, C, D, np.eye(B.shape[-1])))
             zero = np.zeros((2 * n, B.shape[-1]))
             if channel == 1:
@@ -146,16 +146,6 @@ class MixedInequalities:
                     _blocks([[-W - Wt, W, B, -Ct], [Wt, G, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]])
                 )
         return blocks
-
-    def _channel(self, channel: int, v: Values, scale: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
-        """B~, C~, D~ of one channel, scaled; disturbances without effect on it are left out."""
-        p = self.plant
-        part = p.channel(p.rows(channel), p.columns(channel))
-        used = np.any(np.vstack([part.B1, part.D21, part.D11]), axis=0)
-        B1, D21, D11 = part.B1[:, used], part.D21[:, used], part.D11[:, used]
-        B = np.concatenate([B1 + part.B2 @ v["Dn"] @ D21, v["Y"] @ B1 + v["Bn"] @ D21], axis=-2)
-        C = np.concatenate([part.C1 @ v["X"] + part.D12 @ v["Cn"], part.C1 + part.D12 @ v["Dn"] @ part.C2], axis=-1)
-        return scale[:, None] * B, C * scale, D11 + part.D12 @ v["Dn"] @ D21
 
     def controller(self, x: AnyArray) -> StateSpace:
         """Controller of the plant before balancing (for D22 = 0) from the variables; ``V U = I - Y X``."""
@@ -169,6 +159,14 @@ class MixedInequalities:
         middle = v["An"] + eye - V @ B @ p.C2 @ X - Y @ p.B2 @ C @ U - Y @ (p.A + p.B2 @ Dn @ p.C2) @ X
         A = solve(V, solve(U.T, middle.T).T)
         return StateSpace(A, B, C, Dn, p.dt).multiplied(self.controls, 1 / self.measurements)
+
+
+def _channel(p: GeneralizedPlant, v: Values, scale: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """B~, C~, D~ of one channel, scaled; disturbances without effect on it are left out."""
+    p = p.channel(slice(None), np.any(np.vstack([p.B1, p.D21, p.D11]), axis=0))
+    B = np.concatenate([p.B1 + p.B2 @ v["Dn"] @ p.D21, v["Y"] @ p.B1 + v["Bn"] @ p.D21], axis=-2)
+    C = np.concatenate([p.C1 @ v["X"] + p.D12 @ v["Cn"], p.C1 + p.D12 @ v["Dn"] @ p.C2], axis=-1)
+    return scale[:, None] * B, C * scale, p.D11 + p.D12 @ v["Dn"] @ p.D21
 
 
 def _blocks(rows: list[list[AnyArray]]) -> AnyArray:

@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.linalg import LinAlgError, cond, eigh, eigvalsh, norm, svd
 
-from ...core import EPS, SINGULAR, TINY, AnyArray, StateSpace, SynthesisError, frozen
+from ...core import EPS, SINGULAR, TINY, AnyArray, StateSpace, SynthesisError, frozen, gain
 from ...core.linalg import balanced_size, spectral_radius
 from ...core.norms import to_continuous
 from ..generalized_plant import GeneralizedPlant, split
@@ -84,7 +84,7 @@ class Frame:
 
     def _given(self, K: StateSpace) -> StateSpace:
         """Controller of the given plant for one of the normalised plant."""
-        K = StateSpace(K.A, K.B @ self.right, self.left @ K.C, self.left @ K.D @ self.right, 0.0)
+        K = gain(self.left, 0.0) @ K @ gain(self.right, 0.0)
         K = _to_discrete(K, self.given.dt) if self.given.dt > 0 else K
         # In discrete time: for a controller with a pole at z = -1 the continuous loop would have no solution.
         return absorb_feedthrough(absorb_feedthrough(K, self.D22), self.given.D22)
@@ -119,8 +119,7 @@ def _central(p: GeneralizedPlant, gamma: float, X: AnyArray, F: AnyArray, Y: Any
     """Central controller of the normalised plant (Zhou, Doyle and Glover, theorem 17.1)."""
     _, n_w, n_u, n_z, n_y = p.sizes
     free_z, free_w = n_z - n_u, n_w - n_y
-    D1111, D1112 = p.D11[:free_z, :free_w], p.D11[:free_z, free_w:]
-    D1121, D1122 = p.D11[free_z:, :free_w], p.D11[free_z:, free_w:]
+    (D1111, D1112), (D1121, D1122) = (np.split(rows, [free_w], axis=1) for rows in np.split(p.D11, [free_z]))
     D = -D1121 @ D1111.T @ np.linalg.solve(gamma**2 * np.eye(free_z) - D1111 @ D1111.T, D1112) - D1122
     innovation = p.C2 + F[free_w:n_w]
     E = np.eye(len(X)) - Y @ X / gamma**2

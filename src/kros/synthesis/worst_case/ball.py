@@ -93,9 +93,8 @@ def _without_centre(s: AnyArray, q: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Optimal multipliers for ``a = 0``: the dual of the sorted assignment (s and q descend)."""
     rows, columns = s.shape[-1], q.shape[-1]
     size = max(rows, columns)
-    s, q = (np.concatenate([x, np.zeros((*x.shape[:-1], size - x.shape[-1]))], axis=-1) for x in (s, q))
-    following = np.concatenate([s[..., 1:] ** 2, np.zeros((*s.shape[:-1], 1))], axis=-1)
-    steps = (s**2 - following) * q**2
+    s, q = (np.pad(x, ((0, 0), (0, size - x.shape[-1]))) for x in (s, q))
+    steps = -np.diff(s**2, append=0.0) * q**2
     g = np.cumsum(steps[..., ::-1], axis=-1)[..., ::-1]
     return g[..., :rows], np.maximum(s**2 * q**2 - g, 0.0)[..., :columns]
 

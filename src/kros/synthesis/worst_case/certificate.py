@@ -85,11 +85,12 @@ def _edges(centers: AnyArray) -> AnyArray:
     angle, width = np.abs(centers.imag), np.abs(centers.real)
     size = np.hypot(angle, width)
     low = min(max(1e-2 * size.min(initial=np.pi), ROUNDING), 1e-3)
-    widths = np.concatenate([-(4.0 ** np.arange(8)), [0.0], 4.0 ** np.arange(8)])
+    powers = 4.0 ** np.arange(8)
+    widths = np.concatenate([-powers, [0.0], powers])
     around = (angle[:, None] + width[:, None] * widths).ravel()
     around = around[(around > low) & (around < np.pi)]
     edges = np.unique(np.concatenate([np.geomspace(low, np.pi, 2 + int(3 * np.log10(np.pi / low))), around]))
-    apart = np.concatenate([[True], np.diff(np.log(edges)) > ITERATED])
+    apart = np.diff(np.log(edges), prepend=-np.inf) > ITERATED
     return np.concatenate([[0.0], edges[apart]])
 
 

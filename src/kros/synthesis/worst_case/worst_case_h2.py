@@ -112,7 +112,7 @@ def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> 
         controller=controller,
         status=Status.CERTIFIED,
         injection=problem.injection,
-        h2_norm=h2_norm(StateSpace(loop.A, loop.B[:, white:], loop.C, loop.D[:, white:], loop.dt)),
+        h2_norm=h2_norm(loop @ gain(np.eye(loop.n_inputs)[:, white:], loop.dt)),
         worst_case_h2=certify_errors(problem, loop),
         spectral_radius=loop.largest_pole(),
     )

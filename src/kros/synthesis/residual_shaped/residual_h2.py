@@ -53,11 +53,6 @@ class Basis:
     # Of the lags, inside the unit circle, each one once: disturbances that last up to 300 samples
     poles: tuple[float, ...] = (0.9, 0.97, 0.99, 0.997)
 
-    @property
-    def size(self) -> int:
-        """States a channel."""
-        return self.delays + len(self.poles)
-
     @cached_property
     def scalar(self) -> StateSpace:
         """The basis of one channel; its outputs are the states."""
@@ -66,11 +61,7 @@ class Basis:
         poles = np.array(self.poles)
         b = np.concatenate([np.eye(self.delays, 1)[:, 0], np.sqrt(1 - poles**2)])[:, None]
         A = block_diag(np.eye(self.delays, k=-1), np.diag(poles))
-        return StateSpace(A, b, np.eye(self.size), np.zeros_like(b), 1.0)
-
-    def system(self, n: int) -> tuple[AnyArray, AnyArray]:
-        """Return A_z and B_z for n channels, the channels of one delay or lag side by side."""
-        return np.kron(self.scalar.A, np.eye(n)), np.kron(self.scalar.B, np.eye(n))
+        return StateSpace(A, b, np.eye(len(A)), np.zeros_like(b), 1.0)
 
 
 def circle_weights(f: int) -> AnyArray:
@@ -90,8 +81,8 @@ def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
         raise SynthesisError("Shaping filter: the residual is zero or not finite; correct nothing (open loop).")
     floor = _FLOOR * largest * np.eye(n)
     R, spectrum = R + floor, spectrum + floor
-    response = basis.scalar.frequency_response(np.linspace(0, 0.5, f))[..., 0]
-    k = basis.size
+    scalar = basis.scalar
+    response, k = scalar.frequency_response(np.linspace(0, 0.5, f))[..., 0], scalar.n_states
     blocks = np.einsum("f,fa,fb,fij->aibj", weight, response, response.conj(), spectrum, optimize=True).real
     G = blocks.reshape(k * n, k * n)
     cross = np.einsum("f,fb,fij->ibj", weight, response.conj(), spectrum, optimize=True).real.reshape(n, k * n)
@@ -103,7 +94,7 @@ def shaping_filter(spectrum: AnyArray, basis: Basis, dt: float) -> StateSpace:
         problem = f"the residual can be predicted to {error}, it is constant or a few tones"
         raise SynthesisError(f"Shaping filter: {problem}; record longer or richer episodes.")
     root = vectors * np.sqrt(np.maximum(values, 0))
-    A, B = basis.system(n)
+    A, B = (np.kron(M, np.eye(n)) for M in (scalar.A, scalar.B))  # the channels of one delay or lag side by side
     return StateSpace(A + B @ Theta, B @ root, Theta, root, dt)
 
 

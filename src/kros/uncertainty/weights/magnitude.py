@@ -120,7 +120,7 @@ def fit_magnitude(
     (system,) = bound.sections.systems(sample_period_s)
     ratio = np.abs(system.frequency_response(freqs)[:, 0, 0]) / values
     touch = (1 + 4 * EPS) / ratio.min()
-    touching = replace(system, C=system.C * touch, D=system.D * touch)
+    touching = gain([[touch]], sample_period_s) @ system
     return FittedMagnitude(touching, float(20 * np.log10(ratio.max() / ratio.min())))
 
 

@@ -93,23 +93,27 @@ def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Part
     n, at = len(observer.recorded), list(observer.measured)
     estimates = run_observer(observer, batch.measurements(at), batch.inputs, observer.own(batch.parameters))
     square = error_rms(estimates, batch.states, batch.lengths) ** 2
-    units = list(dict.fromkeys(batch.units))
-    errors = np.sqrt([square[[u == unit for u in batch.units]].mean(axis=0) for unit in units])
+    units = grouped(range(len(square)), batch.units.__getitem__)
+    errors = np.sqrt([square[rows].mean(axis=0) for rows in units.values()])
     sizes, by = task.models.output_scale[:n], factors(observer, {})[0]
     scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(at)))
     recorded = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[at])
-    bound = left_out_bound(observer, sizes, units, errors, design.facts["left_out_worst_percent"])
+    bound = left_out_bound(observer, sizes, list(units), errors, design.facts["left_out_worst_percent"])
     return observer.guard, replace(filter_certificate(observer, scales), scales=recorded), bound
 
 
 def _facts(certificate: ReliftCertificate, bound: SignalBound, observer: Observer, errors: Sequence[float]) -> Record:
     """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
-    facts: Record = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
-    facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
-    facts |= bound.facts() | {"assumptions": certificate.assumptions}
     recorded = bound.cover * factors(observer, {})[0][: len(bound.states)]
-    cover = zip(bound.states, recorded.tolist(), strict=True)
-    facts["set_bound"] = {state: value if np.isfinite(value) else None for state, value in cover}
+    facts: Record = {
+        "relift_certified": certificate.certified,
+        "relift_gain": certificate.gain,
+        "hidden_error_percent": errors[0],
+        "loss_error_percent": errors[1],
+        **bound.facts(),
+        "assumptions": certificate.assumptions,
+        "set_bound": dict(zip(bound.states, recorded.tolist(), strict=True)),
+    }
     return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 
 
@@ -146,8 +150,8 @@ def certify_model(
     if certificate.status is ReliftStatus.UNBOUNDED:
         signals = np.concatenate([np.concatenate([b.states, b.inputs], axis=-1)[b.inside] for b in batches])
         low, high = signals.min(axis=0), signals.max(axis=0)
-        middle, half = (low + high) / 2, DEFAULT.box * (high - low) / 2
-        ends = zip((middle - half).tolist(), (middle + half).tolist(), strict=True)
+        room = (DEFAULT.box - 1) * (high - low) / 2
+        ends = zip((low - room).tolist(), (high + room).tolist(), strict=True)
         box = dict(zip((*observer.recorded, *models.recorded_inputs), ends, strict=True))
         values = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
         certificate = relift_certificate(observer, box, scales, values)

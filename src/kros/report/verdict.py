@@ -224,7 +224,7 @@ def _of_errors(facts: Facts) -> Checks:
     if large := {c: e for c in hidden if inf > (e := _worst(facts, c)[1]) > 100 * THRESHOLDS.large}:
         each = joined([f"{words(c)} ({number(e)} % of the largest value)" for c, e in large.items()])
         yield f"The error is large: {each}.", "Measure another signal, or use the estimate for trends alone.", "errors"
-    for channel, bound in (facts.entry.get("set_bound") or {}).items():
+    for channel, bound in facts.entry.get("set_bound", {}).items():
         if exceeding := _exceeding(facts, channel, bound):
             text = f"A held-out episode exceeds the largest RMS error expected: {words(channel)} of unit "
             rms, expected = (facts.quantity(channel, v) for v in (facts.cells[channel].worst_rms, bound))
@@ -283,7 +283,7 @@ def certificates(facts: Facts) -> list[str]:
     if entry.get("worst_case_h2") is not None:
         norm = number(entry["worst_case_h2"])
         texts.append(f"For the set of linear plants: the H2 norm of the error is at most {norm}.")
-    bounds = {c: b for c, b in (entry.get("set_bound") or {}).items() if b is not None and entry.get("set_certified")}
+    bounds = {c: b for c, b in entry.get("set_bound", {}).items() if b is not None and entry.get("set_certified")}
     hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
     if hidden:
         exceeded = {c: some(_exceeding(facts, c, bounds[c])) for c in hidden}

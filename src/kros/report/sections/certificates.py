@@ -52,7 +52,7 @@ def _table(facts: Facts) -> Table | None:
         radius, lower = entry.get("spectral_radius_max"), not label_of(name).baseline and entry.get("lower_bound")
         row: Row = {"observer": observer_label(name), "radius": radius and minus(radius_text(radius)), **entry}
         row |= {} if lower else {"lower_bound": None, "gap_percent": None}  # a baseline's optimum bounds no worst case
-        row |= {("bound", c): bound for c, bound in (entry.get("set_bound") or {}).items()}
+        row |= {("bound", c): bound for c, bound in entry.get("set_bound", {}).items()}
         rows.append(row | {("worst", c): cell.worst_rms for c, cell in errors.get(name, {}).items()})
     columns = [
         Column("observer"),
@@ -62,7 +62,7 @@ def _table(facts: Facts) -> Table | None:
         Column("lower bound", "lower_bound", "set of plants"),
         Column("gap (%)", "gap_percent", "set of plants"),
     ]
-    for channel in dict.fromkeys(c for row in rows for c in row.get("set_bound") or {} if c not in facts.measured):
+    for channel in dict.fromkeys(c for row in rows for c in row.get("set_bound", {}) if c not in facts.measured):
         group = f"recorded signals: {facts.axis(channel)}"
         columns += [Column("bound", ("bound", channel), group), Column("worst RMS error", ("worst", channel), group)]
     columns.append(Column("gain at most", "relift_gain", "at run time"))

@@ -143,11 +143,9 @@ def weighted(shares: Array) -> Array:
 
 
 def _decibels(mean_squares: Array, weights: Array) -> Array:
-    """Return weighted means of levels, shape (n_samples,), of mean squares (n_samples, q, bands), band by band."""
-    level = np.zeros(len(mean_squares))
-    for channel, band in np.argwhere(weights > 0):
-        level += weights[channel, band] * np.log10(np.maximum(mean_squares[:, channel, band], EPS**2))
-    return level * (10 / WEIGHT)
+    """Return weighted means of levels, shape (n_samples,), of mean squares (n_samples, q, bands)."""
+    used = weights > 0
+    return np.log10(np.maximum(mean_squares[:, used], EPS**2)) @ weights[used] * (10 / WEIGHT)
 
 
 def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:

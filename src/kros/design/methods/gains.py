@@ -55,11 +55,8 @@ class KalmanTuned(Method):
         dynamics = mean_error_dynamics(A, mean_slopes(lifting, batch.states, batch.inputs, batch.parameters))
         noise, C = np.diag(task.noise**2), np.eye(n)[list(models.measured)]
         candidates = _candidates(dynamics, C, covariance, noise, models.sample_period_s)
-        more = (0, lifting.n_lifted - n), (0, 0)  # rows of zeros for the lifted functions
-        tried = [
-            (level, replace(gains, controller=gain(np.pad(gains.controller.D, more), models.sample_period_s)))
-            for level, gains in candidates
-        ]
+        lift = gain(np.eye(lifting.n_lifted, n), models.sample_period_s)  # lifted functions are not corrected
+        tried = [(level, replace(gains, controller=lift @ gains.controller)) for level, gains in candidates]
         observers = [task.observer(gains, (A, B)) for _, gains in tried]
         errors = hidden_mean(percent_of(observers, batch), models.measured) if tried else np.array([np.inf])
         first = int(np.argmin(errors))

@@ -79,9 +79,15 @@ class Source:
         from jinja2 import Environment, PackageLoader, StrictUndefined
 
         environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
-        filters = {"row": partial(row, precision=self.precision), "sums": self.sums, "code": self.code}
-        filters |= {"literal": self.precision.literal, "double": DOUBLE.literal, "wide": row, "plain": plain}
-        environment.filters |= filters
+        environment.filters |= {
+            "row": partial(row, precision=self.precision),
+            "sums": self.sums,
+            "code": self.code,
+            "literal": self.precision.literal,
+            "double": DOUBLE.literal,
+            "wide": row,
+            "plain": plain,
+        }
         context = self.context() | more
         return {file: environment.get_template(f"{name}.jinja").render(context) for file, name in files.items()}
 
@@ -142,16 +148,19 @@ class Source:
         }
 
     def factors(self) -> dict[str, float]:
-        """Return by what recordings are multiplied, by name; a load torque has the unit of its current."""
+        """Return by what recordings are multiplied, by name."""
         names = (*self.observer.recorded, *self.observer.inputs)
-        found = dict(zip(names, recorded_factors(self.observer, names).tolist(), strict=True))
-        return found if self.load is None else found | {self.load.load: found[self.load.current]}
+        factors = recorded_factors(self.observer, list(map(self.channel, names)))
+        return dict(zip(names, factors.tolist(), strict=True))
+
+    def channel(self, name: str) -> str:
+        """Return the channel that has the unit of a signal: of a load torque its current, else the signal."""
+        return self.load.current if self.load is not None and name == self.load.load else name
 
     def signals(self) -> list[dict[str, str]]:
         """Return name, unit of measure and note of every channel, as they stand in the recordings."""
         o = self.observer
-        load = {} if self.load is None else {self.load.load: recorded_channel(o, self.load.current)}
-        own = {name: load.get(name, recorded_channel(o, name)) for name in (*o.recorded, *o.inputs)}
+        own = {name: recorded_channel(o, self.channel(name)) for name in (*o.recorded, *o.inputs)}
         return [
             {"name": plain(name), "unit": plain(c.unit or "not declared"), "note": " ".join(map(plain, c.note.split()))}
             for name, c in own.items()

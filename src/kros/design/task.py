@@ -84,10 +84,15 @@ class Design(Shown):
 
     def _summary_rows(self) -> Record:
         facts = self.facts
-        rows = {f"bound of {state}, %": bound for state, bound in facts.get("set_bound_percent", {}).items()}
-        rows |= {"training error, %": facts.get("hidden_error_percent"), "lower bound": self.lower_bound}
-        rows |= {"worst-case H2": facts.get("worst_case_h2"), "certificate": self.certificate}
-        return self.observer._summary_rows() | rows | {"certified": self.certified}
+        return {
+            **self.observer._summary_rows(),
+            **{f"bound of {state}, %": bound for state, bound in facts.get("set_bound_percent", {}).items()},
+            "training error, %": facts.get("hidden_error_percent"),
+            "lower bound": self.lower_bound,
+            "worst-case H2": facts.get("worst_case_h2"),
+            "certificate": self.certificate,
+            "certified": self.certified,
+        }
 
     @property
     def certified(self) -> bool:

@@ -45,9 +45,17 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
     dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)  # the tones of the figures, for light and dark pages
     loader, strict = FileSystemLoader(_TEMPLATES), StrictUndefined
     pages = Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
-    absent: Record = {"head": None, "evidence": (), "figures": {}}
-    parts |= {"name": name, "subtitle": subtitle, "sections": sections, "light": light, "dark": dark}
-    return pages.get_template("report.html.jinja").render(absent | parts)
+    shown: Record = {
+        "head": None,
+        "evidence": (),
+        "figures": {},
+        "name": name,
+        "subtitle": subtitle,
+        "sections": sections,
+        "light": light,
+        "dark": dark,
+    }
+    return pages.get_template("report.html.jinja").render(shown | parts)
 
 
 def encoded(run: RunFolder, name: str) -> Drawn:

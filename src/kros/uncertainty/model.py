@@ -131,9 +131,14 @@ class UncertainModel(Shown, Uncertainty, Storable):
 
     def _summary_rows(self) -> Record:
         nominal = f"unit {self.nominal_id}, {self.nominal_system.n_states} states"
-        rows = {"units": len(self.unit_ids), "nominal": nominal, "uncertainty": self.about}
-        rows |= {"residual over bound": self.cover_max, "bound above optimum": f"{self.overbound_db_max:.3g} dB"}
-        return rows | {f"peak, {form.value}": f"{peak:.3g} dB" for form, peak in self.peak_db.items()}
+        return {
+            "units": len(self.unit_ids),
+            "nominal": nominal,
+            "uncertainty": self.about,
+            "residual over bound": self.cover_max,
+            "bound above optimum": f"{self.overbound_db_max:.3g} dB",
+            **{f"peak, {form.value}": f"{peak:.3g} dB" for form, peak in self.peak_db.items()},
+        }
 
     @property
     def sample_period_s(self) -> float:

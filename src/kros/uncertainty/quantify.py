@@ -59,9 +59,12 @@ class UncertainModels(Shown):
 
     def _summary_rows(self) -> Record:
         flagged = [f"{row['unit']} ({row['condition']})" for row in self.scores if row["outlier"]]
-        rows: Record = {kind: uncertain.about for kind, uncertain in self.sets.items()}
-        rows |= {"nominal unit": self.nominal, "farthest unit": self.worst_off_nominal}
-        return rows | {"outliers": ", ".join(flagged) or "none"}
+        return {
+            **{kind: uncertain.about for kind, uncertain in self.sets.items()},
+            "nominal unit": self.nominal,
+            "farthest unit": self.worst_off_nominal,
+            "outliers": ", ".join(flagged) or "none",
+        }
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with models and recordings, in the layout of a run folder."""
@@ -75,8 +78,12 @@ class UncertainModels(Shown):
         for place, outliers in self.outliers.items():
             outliers.save(folder / "outliers" / place)
         write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
-        content: Record = {"nominal": self.nominal, "worst_off_nominal": self.worst_off_nominal}
-        content |= {"kinds": list(self.sets), "outliers": list(self.outliers)}
+        content = {
+            "nominal": self.nominal,
+            "worst_off_nominal": self.worst_off_nominal,
+            "kinds": list(self.sets),
+            "outliers": list(self.outliers),
+        }
         save_artifact(folder / "uncertainty", _KIND, content)
 
     @classmethod

@@ -127,10 +127,17 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
     rows = list[Record]()
     for index, (name, causality, text, start) in enumerate([*every, *outputs, ("status", "output", bits, None)]):
         shown = plain(name)
-        row = {"name": f"{shown}_hat" if text.startswith("estimate") else shown, "causality": causality, "start": start}
-        row |= {"variability": "tunable" if causality == "parameter" else "discrete", "description": text.format(shown)}
-        row |= {"kind": "bits" if text == bits else "real", "unit": units.get(name, "")}
-        rows.append(row | {"index": index})
+        row = {
+            "name": f"{shown}_hat" if text.startswith("estimate") else shown,
+            "causality": causality,
+            "start": start,
+            "variability": "tunable" if causality == "parameter" else "discrete",
+            "description": text.format(shown),
+            "kind": "bits" if text == bits else "real",
+            "unit": units.get(name, ""),
+            "index": index,
+        }
+        rows.append(row)
     return rows
 
 

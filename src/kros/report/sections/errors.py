@@ -68,8 +68,13 @@ def _row(table: ErrorTable, name: str) -> Row:
     row: Row = {"observer": observer_label(name), "condition": condition_label(table.condition)}
     for channel, cell in table.cells[name].items():
         interval, lag_s = "–".join(number(v, 2) for v in cell.interval), cell.means.get("true_lag_s")
-        known = {"mean": cell.shown, "worst": cell.worst, "interval": interval}
-        known |= {**cell.means, "lag": lag_s and 1e3 * lag_s}
+        known = {
+            "mean": cell.shown,
+            "worst": cell.worst,
+            "interval": interval,
+            **cell.means,
+            "lag": lag_s and 1e3 * lag_s,
+        }
         row |= {(channel, key): value for key, value in known.items()}
     return row
 
@@ -86,8 +91,13 @@ def _table(
     columns = list(about)
     for channel in dict.fromkeys(c for table in tables for c in table.hidden):
         unit = facts.unit(channel)
-        titles = {"mean": "mean (%)", "worst": "worst (%)", "rms": f"RMS ({unit})" if unit else "RMS"}
-        titles |= {"true_error_percent": "against the true signal (%)", "lag": "lag (ms)"}
+        titles = {
+            "mean": "mean (%)",
+            "worst": "worst (%)",
+            "rms": f"RMS ({unit})" if unit else "RMS",
+            "true_error_percent": "against the true signal (%)",
+            "lag": "lag (ms)",
+        }
         for key, title in titles.items():
             note = (channel, "interval") if key == "mean" and options else ""
             columns.append(Column(title, (channel, key), words(channel), best=key in ("mean", "worst"), note=note))

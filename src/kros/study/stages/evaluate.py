@@ -81,14 +81,16 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     identified, sensor = context.identified, context.config.sensor
     first = identified.models()
     training, whole = TrainingSet.of(identified, first, sensor), TrainingSet.whole(identified, first, sensor)
-    makers = {}
+    makers = dict[str, Callable[[], Baseline]]()
     if first.lifting.functions or first.lifting.input_functions:
         noise = measurement_noise(identified, first, sensor)
         makers[f"{first.name}/ekf"] = partial(make_extended, training, first, context.uncertain.nominal, noise)
-    profile = partial(make_mean_profile, whole, first.measured, episodes.population, episodes.keys)
-    makers["filtered_difference"] = partial(make_difference, training, first.measured)
-    makers |= {"mean_profile": profile, "learned": partial(make_learned, whole, first.measured)}
-    makers |= {kind: partial(make_trained, whole, first.measured, kind) for kind in get_args(Regressor)}
+    makers |= {
+        "filtered_difference": partial(make_difference, training, first.measured),
+        "mean_profile": partial(make_mean_profile, whole, first.measured, episodes.population, episodes.keys),
+        "learned": partial(make_learned, whole, first.measured),
+        **{kind: partial(make_trained, whole, first.measured, kind) for kind in get_args(Regressor)},
+    }
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
 
 

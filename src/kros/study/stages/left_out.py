@@ -129,9 +129,16 @@ def next_unit(context: Context) -> Record:
     hidden = [c for c in population.states if c not in population.measured] or list(population.states)
     reserved, pooled = ([r for r in part if r["condition"] == home] for part in (rows, known))
     confidence = context.config.evaluate.confidence
-    content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": confidence}
-    content |= {"observer": deployed, "condition": home, "rows": rows, "failed": failed}
-    return content | bounds_of(reserved, pooled, hidden, confidence, len(failed))
+    return {
+        "reserve": len(facts.reserve),
+        "units": facts.reserve,
+        "confidence": confidence,
+        "observer": deployed,
+        "condition": home,
+        "rows": rows,
+        "failed": failed,
+        **bounds_of(reserved, pooled, hidden, confidence, len(failed)),
+    }
 
 
 def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float, lost: int = 0) -> Record:

@@ -195,7 +195,7 @@ def make_mean_profile(
         states = [np.mean([p for unit, p in of_units.items() if unit != left_out], axis=0) for of_units in means]
         return MeanProfile(n, estimated, motions, states)
 
-    by_unit = {unit: without(unit) for unit in {unit for of_units in means for unit in of_units} | {""}}
+    by_unit = {unit: without(unit) for unit in set[str]().union([""], *means)}
     facts = {"status": "averaged", "motions": len(known), "left_out": "the unit under test"}
     return Baseline(by_unit, measured, estimated, facts, training.seen)
 

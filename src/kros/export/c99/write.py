@@ -101,10 +101,12 @@ def _golden(source: Source) -> Record:
         "u": (golden.u, observer.inputs),
         "x": (golden.x_hat, observer.recorded),
     }
-    recorded = {name: values / [factors[channel] for channel in names] for name, (values, names) in signals.items()}
     allowed = golden.allowed / np.abs([factors[channel] for channel in observer.recorded])
     literals = {
-        **{name: [[_sample(v) for v in row] for row in values] for name, values in recorded.items()},
+        **{
+            name: [[_sample(v) for v in row] for row in values / [factors[channel] for channel in names]]
+            for name, (values, names) in signals.items()
+        },
         "status": [f"{bits}u" for bits in golden.status],
         "last": [f"{bits}u" for bits in golden.last_status],
         "sure": [[f"{bits}u" for bits in of_bits] for of_bits in golden.sure],
@@ -217,6 +219,7 @@ def rounded_to_single(observer: Observer) -> Observer:
     def single(values: Array) -> Array:
         return values.astype(np.float32).astype(float)
 
-    K = StateSpace(single(K.A), single(K.B), single(K.C), single(K.D), K.dt)
+    A, B, C, D = map(single, K.matrices)
+    K = StateSpace(A, B, C, D, K.dt)
     bank = None if bank is None else replace(bank, start=single(bank.start))
     return replace(observer, A=single(observer.A), B=single(observer.B), controller=K, bank=bank)

@@ -68,7 +68,7 @@ def to_control(
             raise DimensionError(f"to_control: {count} {kind} need as many different names, found {names!r}.")
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
     # Copies: python-control may change matrices in place. States that do nothing stay, since they carry names.
-    matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
+    matrices = map(np.array, system.matrices)
     return control.StateSpace(*matrices, system.dt, remove_useless_states=False, name=name and _label(name), **labels)
 
 

@@ -78,11 +78,19 @@ def score_condition(
 def score_row(score: OutlierScore, models: ModelSet, episodes: int, recorded_s: float) -> Record:
     """Return a score as a row of metrics, with what was recorded and what is needed."""
     same = ["outlier", "freq_hz", "excess_db", "lowest_db", "highest_db", "status", "fewest_units"]
-    row = {"unit": score.unit, "condition": models.condition, "score": score.score_db, "threshold": score.threshold_db}
     states = dict(zip(models.lifting.states, score.detectable_percent, strict=False))
     hidden = [name for i, name in enumerate(states) if i not in models.measured] or list(states)
-    row |= {key: getattr(score, key) for key in same} | {"detectable": {name: states[name] for name in hidden}}
-    return row | {"episodes": episodes, "recorded_s": recorded_s, "needed_s": recorded_s * score.more_data}
+    return {
+        "unit": score.unit,
+        "condition": models.condition,
+        "score": score.score_db,
+        "threshold": score.threshold_db,
+        **{key: getattr(score, key) for key in same},
+        "detectable": {name: states[name] for name in hidden},
+        "episodes": episodes,
+        "recorded_s": recorded_s,
+        "needed_s": recorded_s * score.more_data,
+    }
 
 
 @frozen

@@ -109,7 +109,7 @@ class Descriptor:
     def of(cls, system: StateSpace) -> Descriptor:
         """Return a discrete system."""
         mapped = to_continuous(system)
-        return cls(np.eye(mapped.n_states), mapped.A, mapped.B, mapped.C, mapped.D)
+        return cls(np.eye(mapped.n_states), *mapped.matrices)
 
     def __matmul__(self, first: Descriptor) -> Descriptor:
         """Return the series connection, the other one first."""

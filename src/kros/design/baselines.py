@@ -143,8 +143,7 @@ def make_trained(training: TrainingSet, measured: Columns, kind: Regressor) -> B
 def nearest(motions: Sequence[Array], u: Array) -> tuple[int, float]:
     """Return the motion whose inputs have the least RMS difference from some, and that over the largest."""
     sizes = np.max([np.abs(motion).max(axis=0) for motion in (*motions, u)], axis=0)
-    both = ((u[: len(motion)], motion[: len(u)]) for motion in motions)
-    squares = (np.mean((one - other) ** 2, axis=0) for one, other in both)
+    squares = (np.mean((u[: len(motion)] - motion[: len(u)]) ** 2, axis=0) for motion in motions)
     apart = [float((np.sqrt(square) / np.maximum(sizes, TINY)).max()) for square in squares]
     return apart.index(min(apart)), min(apart)
 

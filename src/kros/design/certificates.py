@@ -119,8 +119,8 @@ def _facts(certificate: ReliftCertificate, bound: SignalBound, observer: Observe
 
 def hidden_error_percent(observers: Sequence[Observer], batches: Sequence[EpisodeBatch], by: Array) -> Array:
     """Return the typical error of hidden states over conditions, (observer,), errors times factors, (observer, n)."""
-    percents = [percent_of(observers, batch) * by for batch in batches]
-    logs = [np.log(hidden_mean(percent, observers[0].measured)) for percent in percents]
+    measured = observers[0].measured
+    logs = [np.log(hidden_mean(percent_of(observers, batch) * by, measured)) for batch in batches]
     return np.exp(np.mean(logs, axis=0))
 
 

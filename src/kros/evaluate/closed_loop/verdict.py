@@ -138,8 +138,8 @@ def close_loop(
     if known["destabilising"] <= 1:
         reasons.append("it is unstable with a member of the set")
     safe = "SAFE" if known.get("margin", 0.0) >= 1 else "UNDECIDED"
-    parts: Record = {"spectral_radius": radius, "diverged": diverged, "assumptions": assumed}
-    return LoopResult("NOT SAFE" if reasons else safe, tuple(reasons), **parts, **known)
+    status = "NOT SAFE" if reasons else safe
+    return LoopResult(status, tuple(reasons), spectral_radius=radius, diverged=diverged, assumptions=assumed, **known)
 
 
 def bounds(loop: LinearLoop, tolerance: float) -> Record:

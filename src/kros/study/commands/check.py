@@ -121,8 +121,15 @@ def errors_beside_bounds(context: Context, population: Population, values: Value
             i, bound = population.states.index(name), bounds[name]
             (size, along, apart), rms = parts[:, i], float(np.mean([outcome.errors[key][i]["rms"] for key in keys]))
             gain = float((abs(along) + np.sqrt(max(bound**2 - apart**2, 0.0))) / max(size, TINY))
-            row = {"state": name, "rms": rms, "bound": bound, "ratio": rms / bound, "unit": population.channels[i].unit}
-            errors.setdefault(place, []).append(row | {"gain_percent": 100 * gain})
+            row = {
+                "state": name,
+                "rms": rms,
+                "bound": bound,
+                "ratio": rms / bound,
+                "unit": population.channels[i].unit,
+                "gain_percent": 100 * gain,
+            }
+            errors.setdefault(place, []).append(row)
     return errors
 
 

@@ -33,8 +33,9 @@ def study_text(source: Path, data: ByName, discovery: Discovery | None, findings
     lines += [
         "",
         "# Nonlinear terms that you know of, such as gravity or a gear's ratio; without any, models are linear.",
+        "# [lifting]",
+        '# functions = ["sin(angle)", "sin(100*angle + phase)"]',
     ]
-    lines += ["# [lifting]", '# functions = ["sin(angle)", "sin(100*angle + phase)"]']
     return "\n".join(lines) + "\n"
 
 

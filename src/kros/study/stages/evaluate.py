@@ -9,12 +9,14 @@ from typing import get_args
 import numpy as np
 
 from ...core import AnyArray, Array, KrosError, Record, save_artifact
+from ...data import Population
 from ...data.population import Keys
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile, make_trained
 from ...design.synthesize import measurement_noise
 from ...design.training import TrainingSet
 from ...evaluate.held_out import HeldOut, Outcome, alike
 from ...evaluate.over_units import interval_rows
+from ...identify.calibration import Values
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
 from ...observer.baselines.learned import Regressor
@@ -28,7 +30,7 @@ def run(context: Context) -> None:
     facts, population, identified = context.facts, context.population, context.identified
     units = {u: identified.parameters[u] for u in facts.groups if u in identified.models().unit_ids}
     keys = tuple(k for k in facts.test if k.unit in units)
-    episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(context))
+    episodes = held_out(context, population, keys, units)
     episodes = replace(episodes, shown=showcase(context, episodes))
     at_home = replace(episodes, keys=tuple(k for k in keys if k.condition == facts.identify_on))
     models = [partial(at_home.models, identified.models(name)) for name in identified.kinds]
@@ -94,12 +96,12 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
 
 
-def band_hz(context: Context) -> tuple[float, float] | None:
-    """Return the band around the gearbox frequency at the population's top speed; None for other plants."""
-    if (spec := context.phase_spec) is None:
-        return None
-    top_speed = context.identified.sizes[spec.reference]
-    return gearbox_band_hz(context.config.calibrate, context.population, top_speed)
+def held_out(context: Context, population: Population, keys: Keys, units: Values) -> HeldOut:
+    """Return episodes as sensors show them, and the band of a gearbox at the top speed of the study's population."""
+    config, spec, band_hz = context.config, context.phase_spec, None
+    if spec is not None:
+        band_hz = gearbox_band_hz(config.calibrate, context.population, context.identified.sizes[spec.reference])
+    return HeldOut(population, keys, units, sensor=config.sensor, band_hz=band_hz)
 
 
 def showcase(context: Context, episodes: HeldOut) -> Keys:

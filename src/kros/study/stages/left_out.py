@@ -18,13 +18,12 @@ import numpy as np
 
 from ...core import ConfigError, KrosError, Progress, Record, load_artifact, save_artifact
 from ...data import split_episodes
-from ...evaluate.held_out import HeldOut
 from ...evaluate.over_units import fewest_units, next_unit_bound
 from ...identify.calibration import unit_parameters, unit_values
 from ...identify.identified import recordings_of, recordings_path
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep, run_steps
-from .evaluate import band_hz, judged
+from .evaluate import held_out, judged
 from .learning import FEWEST, LEARNING
 
 log = logging.getLogger(__name__)
@@ -96,8 +95,15 @@ def without(whole: Context, held: Sequence[str]) -> StudyConfig:
     """Return the study on the prepared recordings of all other units."""
     config, source = whole.config, recordings_path(whole.store.folder).absolute()
     absent = [unit for unit in recordings_of(whole.store.folder).unit_ids if unit not in whole.facts.groups]
-    changes = {"source": source, "reader": "parquet", "prepare": (), "csv": None, "exclude": (*absent, *held)}
-    data = config.data.model_copy(update={**changes, "identify_on": whole.facts.identify_on})
+    changes = {
+        "source": source,
+        "reader": "parquet",
+        "prepare": (),
+        "csv": None,
+        "exclude": (*absent, *held),
+        "identify_on": whole.facts.identify_on,
+    }
+    data = config.data.model_copy(update=changes)
     evaluate = config.evaluate.model_copy(update={"reserve": 0})
     return config.model_copy(update={"data": data, "evaluate": evaluate})
 
@@ -107,7 +113,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     facts, population = whole.facts, whole.population.select(held)
     units = unit_parameters(population, context.calibration, facts.identify_on, facts)
     keys = tuple(k for k in facts.test if k.unit in held)
-    episodes = HeldOut(population, keys, units, sensor=context.config.sensor, band_hz=band_hz(whole))
+    episodes = held_out(whole, population, keys, units)
     _, content = judged(context, episodes, dict.fromkeys(held, FOLDER))
     content["observers"] = {**context.observers_record["facts"], **content.pop("baselines")}
     save_artifact(context.store.draft("evaluation"), FOLDER, content)
@@ -122,7 +128,7 @@ def next_unit(context: Context) -> Record:
     values, _, failed = unit_values(population, context.calibration, home, facts=own)
     rows = []
     if keys := tuple(key for split in splits for key in split.test if key.unit not in failed):
-        episodes = HeldOut(population, keys, values, sensor=context.config.sensor, band_hz=band_hz(context))
+        episodes = held_out(context, population, keys, values)
         (outcome,) = episodes.observers([context.deployed])
         rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.reserve, "reserve"))
     known = [r for r in context.evaluation["evaluation"] if r["observer"] == deployed and r["unit"] in facts.pooled]

@@ -263,7 +263,6 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> Rec
     observer, certificate, facts = design.observer, design.certificate, design.facts
     assert certificate is not None
     proof = {name: getattr(certificate, name) for name in ("certified", "reason", "gain", "assumptions")}
-    trained = {"units": len(set(known.pooled) & set(task.models.unit_ids)), "conditions": identified.conditions}
     channels = (*population.states, *population.inputs)
     content: Record = {
         "kros": version("kros"),
@@ -274,7 +273,11 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> Rec
             name: observer.sensor.get(name, Sensor()).no_finer_than(known.resolution[name]).model_dump()
             for name in population.measured
         },
-        "trained_on": {**trained, "identify_on": known.identify_on},
+        "trained_on": {
+            "units": len(set(known.pooled) & set(task.models.unit_ids)),
+            "conditions": identified.conditions,
+            "identify_on": known.identify_on,
+        },
         "as_it_runs": {**proof, "operating_box": certificate.box},
         "uncertain_set": {"worst_case_h2": facts.get("worst_case_h2"), "reason": facts.get("reason") or ""},
     }
@@ -283,4 +286,6 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> Rec
         content["parameters"] = {calibration.spec.parameter: {**values, "lag_rad": calibration.lag_rad}}
     parts = ("certified", "reason", "bound_percent", "outside")
     signals = {name: facts[f"set_{name}"] for name in parts if f"set_{name}" in facts}
-    return dict(plain(content | ({"recorded_signals": signals} if signals else {})))
+    if signals:
+        content["recorded_signals"] = signals
+    return dict(plain(content))

@@ -48,7 +48,7 @@ class NoiseShare:
 
     def save(self, folder: Path) -> None:
         """Write ``noise_share.json``."""
-        save_artifact(Path(folder), "noise_share", self.facts())
+        save_artifact(folder, "noise_share", self.facts())
 
 
 def noise_share(

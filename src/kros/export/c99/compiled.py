@@ -54,7 +54,7 @@ class CompiledObserver:
     """
 
     def __init__(self, folder: Path, library: Path) -> None:
-        manifest = json.loads((Path(folder) / "manifest.json").read_text())
+        manifest = json.loads((folder / "manifest.json").read_text())
         self.name, self.states = manifest["name"], tuple(manifest["states"])
         self.parameters, self.state_bytes = tuple(manifest["parameters"]), int(manifest["state_bytes"])
         self._q, self._m = len(manifest["measured"]), len(manifest["inputs"])

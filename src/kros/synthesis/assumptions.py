@@ -40,9 +40,12 @@ def unreachable_modes(A: AnyArray, B: AnyArray, dt: float) -> list[complex]:
     B = B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), TINY)
     modes = np.linalg.eigvals(A)
     outside = modes[np.abs(modes) >= 1 - ROUNDING] if dt > 0 else modes[modes.real >= -ROUNDING * (1 + np.abs(modes))]
-    pencils = (np.hstack([A - mode * np.eye(len(A)), B]) for mode in outside)
-    values = (np.linalg.svd(pencil, compute_uv=False) for pencil in pencils)
-    return [complex(mode) for mode, s in zip(outside, values, strict=True) if s[-1] <= ITERATED * max(s[0], TINY)]
+    unreached = []
+    for mode in outside:
+        s = np.linalg.svd(np.hstack([A - mode * np.eye(len(A)), B]), compute_uv=False)
+        if s[-1] <= ITERATED * max(s[0], TINY):
+            unreached.append(complex(mode))
+    return unreached
 
 
 def require(plant: Any, method: str, proper: bool = True) -> None:

@@ -82,8 +82,7 @@ def _cell(rows: Sequence[Any], interval: Sequence[float]) -> ErrorCell:
     if any(r["error_percent"] is None for r in rows):
         return ErrorCell()
     numbers = (key for key, value in rows[0].items() if not isinstance(value, str))
-    known = {key: values for key in numbers if None not in (values := [r.get(key) for r in rows])}
-    means = {key: float(np.mean(values)) for key, values in known.items()}
+    means = {key: float(np.mean(values)) for key in numbers if None not in (values := [r.get(key) for r in rows])}
     errors, rms = ({r["unit"]: r[key] for r in rows if r.get(key) is not None} for key in ("error_percent", "rms"))
     return ErrorCell(means, errors, rms, interval)
 

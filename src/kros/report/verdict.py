@@ -189,8 +189,14 @@ def _of_units(facts: Facts) -> Checks:
 
 def units_of_large_errors(facts: Facts) -> list[str]:
     """Return units whose error in a hidden channel, relative and absolute, is far above the median of the others."""
-    units = [r for r in facts.get("evaluation") if r["observer"] == facts.deployed and r["role"] != "outlier"]
-    rows = [r for r in units if r["channel"] in facts.hidden and r["error_percent"] is not None]
+    rows = [
+        r
+        for r in facts.get("evaluation")
+        if r["observer"] == facts.deployed
+        and r["role"] != "outlier"
+        and r["channel"] in facts.hidden
+        and r["error_percent"] is not None
+    ]
     texts = []
     for (condition, channel), of in grouped(rows, itemgetter("condition", "channel")).items():
         sizes = np.array([(r["error_percent"], r["rms"]) for r in of])
@@ -306,8 +312,10 @@ def voids(facts: Facts) -> list[str]:
         "A controller uses the estimate, on which recordings did not depend: kros loop gives the margin of the loop."
     ]
     if facts.entry.get("set_certified") or facts.entry.get("worst_case_h2") is not None:
-        texts += ["The motion differs from the recorded one, or leaves the range of training."]
-        texts += ["The unit is worn, badly assembled, or of another batch."]
+        texts += [
+            "The motion differs from the recorded one, or leaves the range of training.",
+            "The unit is worn, badly assembled, or of another batch.",
+        ]
     rate = 1 / facts.study["sample_period_s"]
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]
 

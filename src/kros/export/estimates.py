@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,8 +29,8 @@ def writer(out: Path, period_s: float, facts: Record) -> Iterator[Write]:
     from pyarrow import csv, parquet
 
     text = out.suffix == ".csv"
-    columns = [pa.field(name, pa.string()) for name in ("unit", "condition", "episode")]
-    columns += [pa.field("k", pa.int64()), pa.field("time_s", pa.float64()), pa.field("status", pa.string())]
+    columns: list[Any] = [(name, pa.string()) for name in ("unit", "condition", "episode")]
+    columns += [("k", pa.int64()), ("time_s", pa.float64()), ("status", pa.string())]
     for name, unit in facts["columns"].items():
         shown = f"{name} [{unit}]" if text and unit else name
         columns.append(pa.field(shown, pa.float64(), metadata={"unit": unit} if unit else None))

@@ -246,10 +246,9 @@ class Source:
     def bounds(self) -> list[dict[str, str]]:
         """Return the bounds of measurements and inputs in double precision, and those of good samples in single."""
         screen = Screen.of(self.observer)
-        wide = {name: getattr(screen, name) for name in ("lower", "upper", "least", "most")}
-        inner = {"low": np.maximum(screen.lower, screen.least), "high": np.minimum(screen.upper, screen.most)}
-        texts = {name: row(values) for name, values in wide.items()}
-        texts |= {name: row(values, SINGLE) for name, values in inner.items()}
+        texts = {name: row(getattr(screen, name)) for name in ("lower", "upper", "least", "most")}
+        texts["low"] = row(np.maximum(screen.lower, screen.least), SINGLE)
+        texts["high"] = row(np.minimum(screen.upper, screen.most), SINGLE)
         return [dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True)]
 
 

@@ -106,9 +106,9 @@ def bound_responses(
     fields |= {"output_scale": scales[0], "input_scale": scales[1], "sample_period_s": float(dt)}
     bound = fields["bounds"][form]
     text = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
-    middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
-    top = (middle >= bound[:-2]) & (middle >= bound[2:])
-    unresolved = freqs[1:-1][top & (middle > np.maximum(SET.resolved * low, SET.exact * bound.max()))]
+    middle, (low, high) = bound[1:-1], np.sort([bound[:-2], bound[2:]], axis=0)
+    peaked = middle > np.maximum(SET.resolved * low, SET.exact * bound.max())
+    unresolved = freqs[1:-1][peaked & (middle >= high)]
     if unresolved.size:
         some = ", ".join(f"{f:.4g}" for f in unresolved[:5])
         text += f"; they do not resolve {unresolved.size} peaks of the residuals, at {some} Hz"

@@ -184,8 +184,12 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
         raise IdentificationError(f"{problem}; record more units in the condition that feeds synthesis.")
     responses = first.scaled_responses(first.frequencies(settings.n_freqs), units)
     nominal = settings.nominal or units[choose_nominal(responses, settings.form).index]  # as in the paper, for all
-    order, tolerance = settings.max_order, settings.tolerance_db
-    options = Options(unit_ids=tuple(units), nominal=nominal, max_order=order, tolerance_db=tolerance)
+    options = Options(
+        unit_ids=tuple(units),
+        nominal=nominal,
+        max_order=settings.max_order,
+        tolerance_db=settings.tolerance_db,
+    )
     form, every = Form(settings.form), map(models.models, models.kinds)
     tasks = [partial(bound_systems, one, form, one.frequencies(settings.n_freqs), options) for one in every]
     sets = dict(zip(models.kinds, work.run("quantify", tasks), strict=True))

@@ -98,8 +98,9 @@ class ResidualH2(Method):
             raise SynthesisError(
                 "Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings."
             )
-        lifted, order = given.lifting.n_lifted, self.correction_order
-        syntheses = [residual_h2(model.problem, n_lifted=lifted, order=order) for model in models]
+        syntheses = [
+            residual_h2(model.problem, n_lifted=given.lifting.n_lifted, order=self.correction_order) for model in models
+        ]
         observers = [task.observer(one, (model.A, model.B)) for model, one in zip(models, syntheses, strict=True)]
         best, error = task.best(observers)
         if not np.isfinite(error):

@@ -74,5 +74,5 @@ class WorstCaseH2(Method):
 
     def design(self, task: DesignTask) -> Design:
         """Design it for the uncertain set."""
-        problem, order = task.require_problem(), self.max_order
-        return task.designed(worst_case_h2(problem, max_order=order, tolerance_db=self.tolerance_db))
+        problem = task.require_problem()
+        return task.designed(worst_case_h2(problem, max_order=self.max_order, tolerance_db=self.tolerance_db))

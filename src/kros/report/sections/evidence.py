@@ -82,10 +82,14 @@ def spread(facts: Facts) -> Section | None:
         f"six forms; its peak is the largest singular value over units and frequencies. The design uses the form "
         f"“{words(first['form'])}”. Below 0 dB a unit differs by less than the whole signal."
     )
-    rows = []
-    for form in first["peak_db"]:
-        peaks = {name: entry["peak_db"][form] for name, entry in entries.items()}
-        rows.append({"form": words(form), "used": "used" if form == first["form"] else "", **peaks})
+    rows = [
+        {
+            "form": words(form),
+            "used": "used" if form == first["form"] else "",
+            **{name: entry["peak_db"][form] for name, entry in entries.items()},
+        }
+        for form in first["peak_db"]
+    ]
     columns = [Column("form", note="used"), *(Column(f"{model_label(name)} (dB)", name) for name in entries)]
     caption = "Peak residual, with the nominal unit that suits each form best"
     table = build(caption, columns, rows, words(first["form"]))

@@ -81,9 +81,8 @@ def fit_entries(
     sizes = np.abs(E).max(axis=0).reshape(len(freqs_hz), p * m).T
     fit = partial(fit_magnitude, max_order=max_order, tolerance_db=tolerance_db)
     fits = [fit(freqs_hz, size, sample_period_s) for size in sizes]
-    rows, columns = np.kron(np.eye(p), np.ones((1, m))), np.tile(np.eye(m), (p, 1))
-    entries = block_diagonal([fit.system for fit in fits])
-    system = gain(rows, sample_period_s) @ entries @ gain(columns, sample_period_s)
+    sums, copies = (gain(M, sample_period_s) for M in (np.kron(np.eye(p), np.ones(m)), np.tile(np.eye(m), (p, 1))))
+    system = sums @ block_diagonal([fit.system for fit in fits]) @ copies
     orders = np.array([fit.order for fit in fits]).reshape(p, m)
     return EntryWeights(system, orders, _excess(system.frequency_response(freqs_hz), E))
 

@@ -108,15 +108,16 @@ def uncertainty(facts: Facts) -> Section | None:
     rows = []
     for name, entry in entries.items():
         weight, noise = entry["weight"], entry.get("noise_share")
-        row = {
-            "model": model_label(name),
-            "orders, left and right": " and ".join(", ".join(map(str, side)) for side in weight["orders"]),
-            "largest normalised residual": number(weight["cover_max"], 6),
-            "above the optimal bound (dB)": weight["overbound_db_max"],
-            "estimation noise in the spread (%)": noise and 100 * noise["at_peak"],
-            "approximation error": entry["misfit_max"],
-        }
-        rows.append(row)
+        rows.append(
+            {
+                "model": model_label(name),
+                "orders, left and right": " and ".join(", ".join(map(str, side)) for side in weight["orders"]),
+                "largest normalised residual": number(weight["cover_max"], 6),
+                "above the optimal bound (dB)": weight["overbound_db_max"],
+                "estimation noise in the spread (%)": noise and 100 * noise["at_peak"],
+                "approximation error": entry["misfit_max"],
+            }
+        )
     table = build("Weights", [Column(title) for title in rows[0]], rows)
     return Section("uncertainty", "Uncertainty weights", [text], tables=[table], figure="weights")
 

@@ -121,15 +121,16 @@ def errors_beside_bounds(context: Context, population: Population, values: Value
             i, bound = population.states.index(name), bounds[name]
             (size, along, apart), rms = parts[:, i], float(np.mean([outcome.errors[key][i]["rms"] for key in keys]))
             gain = float((abs(along) + np.sqrt(max(bound**2 - apart**2, 0.0))) / max(size, TINY))
-            row = {
-                "state": name,
-                "rms": rms,
-                "bound": bound,
-                "ratio": rms / bound,
-                "unit": population.channels[i].unit,
-                "gain_percent": 100 * gain,
-            }
-            errors.setdefault(place, []).append(row)
+            errors.setdefault(place, []).append(
+                {
+                    "state": name,
+                    "rms": rms,
+                    "bound": bound,
+                    "ratio": rms / bound,
+                    "unit": population.channels[i].unit,
+                    "gain_percent": 100 * gain,
+                }
+            )
     return errors
 
 
@@ -192,20 +193,21 @@ def monitored(recordings: FieldRecordings) -> Rows:
         if monitor is not None and any(good.any() for _, good in judged):
             level = float(monitor.level(np.concatenate(monitor.in_turn(judged))).max())
         outlier = units >= FEWEST_UNITS and level is not None and level > 0
-        row = {
-            **dict.fromkeys(("score", "threshold", "detectable")),
-            "unit": unit,
-            "condition": condition,
-            "outlier": outlier,
-            "episodes": len(keys),
-            "left_out": [],
-            "status": Status.OUTLIER if outlier else Status.CANNOT_TELL,
-            "missing": missing,
-            "level_db": level,
-            "level_units": units,
-            "recorded_s": samples * population.sample_period_s,
-            "samples": counts,
-            "parameters": recordings.sources.get(unit),
-        }
-        rows.append(row)
+        rows.append(
+            {
+                **dict.fromkeys(("score", "threshold", "detectable")),
+                "unit": unit,
+                "condition": condition,
+                "outlier": outlier,
+                "episodes": len(keys),
+                "left_out": [],
+                "status": Status.OUTLIER if outlier else Status.CANNOT_TELL,
+                "missing": missing,
+                "level_db": level,
+                "level_units": units,
+                "recorded_s": samples * population.sample_period_s,
+                "samples": counts,
+                "parameters": recordings.sources.get(unit),
+            }
+        )
     return rows

@@ -84,8 +84,9 @@ class MixedInequalities:
         n, _, n_u, _, n_y = self.plant.sizes
         n_z1 = len(self.plant.C1[self.plant.rows(1)])
         shapes = {"X": (n, n), "Y": (n, n), "An": (n, n), "Bn": (n, n_y), "Cn": (n_u, n), "Dn": (n_u, n_y)}
+        shapes["Z"] = n_z1, n_z1
         places, size = {}, 0
-        for name, (rows, columns) in (shapes | {"Z": (n_z1, n_z1)}).items():
+        for name, (rows, columns) in shapes.items():
             place = np.arange(rows * columns).reshape(rows, columns)
             if name in ("X", "Y", "Z"):  # symmetric
                 upper, place = np.triu_indices(rows), np.zeros((rows, rows), int)

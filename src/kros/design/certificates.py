@@ -46,11 +46,10 @@ Parts = tuple[Guard | None, ReliftCertificate, SignalBound]
 def certify(task: DesignTask, designs: Sequence[Design]) -> list[tuple[Guard | None, ReliftCertificate, Record]]:
     """Return guards, certificates and facts of observers of one lifting, certificates in the recordings' units."""
     batches, observers = certified_on(task), [design.observer for design in designs]
-    bank = observers[0].bank is not None
     parts = (
-        [_filter_parts(design, batches[0], task) for design in designs]
-        if bank
-        else _model_parts(observers, batches, task)
+        _model_parts(observers, batches, task)
+        if observers[0].bank is None
+        else [_filter_parts(design, batches[0], task) for design in designs]
     )
     growth = [design.facts.get("left_out_to_training", {}) for design in designs]
     by = np.array([[of.get(name, 1.0) for name in observers[0].recorded] for of in growth])

@@ -99,7 +99,7 @@ class Gaps:
         self.take(np.zeros((bank.half.size + q + 2 + q * bank.filters, batch)))
 
     def take(self, state: Array) -> None:
-        """Go on from a state whose rows are ages, counts, ages of the start and of a loss, and ramps of all machines."""
+        """Go on from a state whose rows are ages, counts, ages of a start and of a loss, and ramps of all machines."""
         n, q = self.bank.half.size, len(self.measured)
         self.state = state
         age, self.count, self.start, ramp = np.split(state.T, [n, n + q, n + q + 2], axis=1)

@@ -21,8 +21,8 @@ have ages, T and :math:`\mu` of their own, and the larger m counts. The estimate
 After a start, what happened before is not known; after a loss, filters hold what stood for measurements. There
 :math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start and at every loss,
 which
-falls as the slowest filter forgets after a start, and so that m is below one percent as soon as no delay reaches back
-to it after a loss. Limits of the estimates hold before the fallback enters them, so that
+falls so that m is below one percent some of the slowest time constants after a start, and as soon as no delay reaches
+back to a loss. Limits of the estimates hold before the fallback enters them, so that
 little of what is far away is left in long gaps.
 
 A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of

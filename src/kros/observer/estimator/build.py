@@ -206,7 +206,8 @@ def assembled(
 ) -> Observer:
     """Write filters with their readouts, and those of inputs alone, into the model of an observer."""
     channels, bank = design.channels, design.bank
-    without, slowest = channels.without_measurements(), max([*bank.lags, bank.delays])
+    without, settings = channels.without_measurements(), design.settings
+    fades = np.array([settings.start_fade * max([*bank.lags, bank.delays]), bank.delays])  # m is below one percent then
     filters, fallback = systems[0].absolute(channels), systems[1].absolute(without)
     n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
     bare = channels.lifting
@@ -235,7 +236,7 @@ def assembled(
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[:n] for end in design.recordings.ranges)
     ages = np.ones((min(2, len(at)), n))
-    gaps = FilterBank(r, start, ages, np.zeros_like(ages), high - low, np.exp([-1 / slowest, -5 / bank.delays]))
+    gaps = FilterBank(r, start, ages, np.zeros_like(ages), high - low, np.exp(-5 / fades))
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(

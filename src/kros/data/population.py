@@ -246,6 +246,8 @@ class Population(Shown):
 
     def keys(self, unit: str | None = None, condition: str | None = None) -> Keys:
         """Return the episodes of a unit, a condition or both."""
+        if unit is not None and condition is not None:  # fleets ask for each of their units
+            return tuple(self.episodes[i] for i in self._positions.get((unit, condition), ()))
         return tuple(e for e in self.episodes if unit in (None, e.unit) and condition in (None, e.condition))
 
     def read(self, key: EpisodeKey) -> Array:

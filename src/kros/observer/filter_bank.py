@@ -19,11 +19,10 @@ have ages, T and :math:`\mu` of their own, and the larger m counts. The estimate
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
 After a start, what happened before is not known; after a loss, filters hold what stood for measurements. There
-:math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start and at every loss,
-which
-falls so that m is below one percent some of the slowest time constants after a start, and as soon as no delay reaches
-back to a loss. Limits of the estimates hold before the fallback enters them, so that
-little of what is far away is left in long gaps.
+:math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start and at every loss.
+It falls so that m is below one percent some of the slowest time constants after a start, and as soon as no delay
+reaches back to a loss. Limits of the estimates hold before the fallback enters them, so that little of what is far away
+is left in long gaps.
 
 A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of
 states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so

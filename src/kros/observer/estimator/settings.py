@@ -70,9 +70,11 @@ class EstimatorSettings(Settings):
         description="weight of the errors that a start in the middle of an episode makes, for the same time",
     )
     start_fade: float = Field(
-        2.5, gt=0, description="time after a start in which these errors count, in the slowest time constants"
+        2.5,
+        gt=0,
+        description="time after a start until the second readout counts below one percent, in the slowest lags",
     )
-    settled_share: float = Field(3e-4, gt=0, description="weight of these errors for all other time")
+    settled_share: float = Field(3e-4, gt=0, description="weight of the errors of `restart_share` for all other time")
     gap_share: float = Field(
         3e-3,
         ge=0,

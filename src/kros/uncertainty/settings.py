@@ -45,20 +45,18 @@ class QuantifySettings(UncertaintySettings, WeightSettings):
 class FitRule:
     """Fit of diagonal weights and their covers; none of it bears on soundness, which the proof at the end decides."""
 
-    points: int = 160  # frequencies of the joint fit: what is missed between them joins it
+    points: int = 160  # frequencies at which orders are chosen and weights fitted first; the last fit has all
     covered: int = 300  # frequencies at which optimal covers are computed, between which they are interpolated
     units: int = 4  # largest residuals of a frequency in cover and fit; the check has all
     temperatures: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003)  # nepers, of smoothed maxima; the last is 0.03 dB
+    last_temperatures: tuple[float, ...] = (0.01, 0.003)  # of the fit at all frequencies, near the first one
     steps: int = 12  # at most, at each temperature, and of the search of a cover at each of its orders
     squarings: tuple[int, ...] = (1, 3, 6)  # s of the orders 2^s + 1 of the smoothed maximum of covers
-    missed_db: float = 0.05  # cost between the points of the fit that brings further ones
     farthest: float = 1.5  # nepers: largest change of a parameter in a step of the joint fit
     damping: float = 1e-2  # of its first step at a temperature
     trials: int = 8  # of a step, each with eight times the damping
     pull: float = 1e-3  # towards the start, nepers: small, and it makes optima unique
     peak_price: float = 0.05  # of the peak of square weights, which decides among equal covers
-    rounds: int = 5  # fits, each with the frequencies and units missed by the one before
-    deficit: float = 1.02  # ratio beyond which a weight is fitted again, before it is lifted
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,6 @@ class ProofRule:
     density: int = 10  # points of the check for every one of the grid; modes join them
     decades: int = 4  # of tau beyond the grid that are checked
     a_decade: int = 15  # points in each
-    worst: int = 20  # frequencies that join a fit in a round
     rounding: float = ITERATED  # of ratios, by which weights are larger, and of frequencies that are one
 
 

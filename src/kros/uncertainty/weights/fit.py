@@ -1,9 +1,10 @@
 r"""Weights from residuals: a fit at few frequencies, a check at many, a proof at all.
 
-All magnitudes of a diagonal weight are fitted together (`joint`), at the frequencies given and at modes of units and
-residuals that these pass over. The fit is checked on a grid ten times denser, with DC and Nyquist; frequencies that it
-misses join it. What counts is the proof for the systems as returned (`proof`); at last the left weight is scaled until
-it touches.
+All magnitudes of a diagonal weight are fitted together (`joint`): the orders and a first fit at some of the frequencies
+given, then once more at all, and at modes of units and residuals that these pass over. Which frequencies take part does
+not depend on the fit, so that weights follow the residuals continuously. What counts is the proof for the systems as
+returned (`proof`), beside a grid ten times denser with DC and Nyquist; at last the left weight is scaled until it
+touches.
 """
 
 from __future__ import annotations
@@ -41,18 +42,11 @@ def fit_weight(
             raise DataError(f"Weights: {alike}; give frequencies at which they differ.")
         nothing = gain(np.zeros((p, p)), sample_period_s), gain(np.eye(m), sample_period_s)
         return Weight(*nothing, (0,) * p, (0,) * m, 0.0, 0.0), cover
-    at, fitted = fit.start_hz(), None
-    for _ in range(FIT.rounds + 1):
-        problem, near = fit.problem(at)
-        fitted = refit(problem, fitted.sections) if fitted else fit_jointly(problem, near, max_order, tolerance_db)
-        weight = fit.weight(fitted.sections)
-        proof, ratio = fit.proven(weight)
-        missed = fit.costly(weight, fitted.excess_db)
-        if proof.bound > FIT.deficit:
-            missed = np.concatenate([missed, fit.checked_hz[_peaks(ratio - 1)], [proof.freq_hz]])
-        if not missed.size:
-            break
-        at = np.union1d(at, missed)
+    problem, near = fit.problem(fit.few_hz())
+    fitted = fit_jointly(problem, near, max_order, tolerance_db)
+    every, _ = fit.problem(np.union1d(fit.few_hz(), fit.freqs_hz))
+    weight = fit.weight(refit(every, fitted.sections, FIT.last_temperatures).sections)
+    proof, ratio = fit.proven(weight)
     on_grid, left = float(ratio.max()), weight.left
     lift = max(proof.bound, on_grid) * (1 + PROOF.rounding)  # until the left weight touches from above
     left = replace(left, C=left.C * lift, D=left.D * lift)
@@ -94,7 +88,7 @@ class _Fit:
     def _inside(self, freqs_hz: AnyArray) -> Flags:
         return (freqs_hz >= self.band[0]) & (freqs_hz <= self.band[1])
 
-    def start_hz(self) -> AnyArray:
+    def few_hz(self) -> AnyArray:
         """Return evenly chosen frequencies, and fewer beyond the band."""
         even = self.freqs_hz[evenly(len(self.freqs_hz), FIT.points)]
         return np.union1d(even, self.checked_hz[~self._inside(self.checked_hz)][::4])
@@ -116,11 +110,6 @@ class _Fit:
         systems, orders, p = sections.systems(self.dt), tuple(sections.orders.tolist()), self.tight.left.shape[1]
         return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:])
 
-    def costly(self, weight: Weight, excess_db: float) -> AnyArray:
-        """Return the frequencies between those of the fit, Hz, at which the weight costs more than at them."""
-        cost = NEPER_DB * (weight.magnitudes(self.tight_hz).cost() - self.tight.cost())
-        return self.tight_hz[_peaks(cost - excess_db - FIT.missed_db)]
-
     def proven(self, weight: Weight) -> tuple[Certificate, AnyArray]:
         """Certify a weight for all units; return its largest ratios on the checked grid, too."""
 
@@ -131,14 +120,6 @@ class _Fit:
         known = ratio(self.checked_hz) if E is None else weight.magnitudes(self.checked_hz).ratio(E)
         pencils = self.residuals.ratios(weight.left, weight.right)
         return certify(ratio, self.checked_hz, known, pencils, self.dt), known.max(axis=0)
-
-
-def _peaks(excess: AnyArray) -> AnyArray:
-    """Return the indices of the worst local maxima above zero."""
-    from scipy.signal import find_peaks
-
-    tops = find_peaks(np.pad(excess, 1, constant_values=-np.inf), height=0.0)[0] - 1
-    return tops[np.argsort(-excess[tops])[: PROOF.worst]]
 
 
 @frozen

@@ -17,6 +17,7 @@ vectors, `d log sigma = -sum |u_i|^2 d log W_L,i - sum |v_j|^2 d log W_R,j`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -57,11 +58,11 @@ def fit_jointly(problem: JointProblem, cover: Cover, max_order: int, tolerance_d
     return fitted
 
 
-def refit(problem: JointProblem, start: Sections) -> Bound:
+def refit(problem: JointProblem, start: Sections, temperatures: Sequence[float] = FIT.temperatures) -> Bound:
     """Return the best sections of the same orders near a start, raised to be sound."""
     first = start.at(start.parameters, problem.ends)
     state = _State(problem, first, first.parameters)
-    for temperature in FIT.temperatures:
+    for temperature in temperatures:
         damping = FIT.damping
         for _ in range(FIT.steps):
             better = state.step(temperature, damping)

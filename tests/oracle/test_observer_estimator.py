@@ -27,8 +27,8 @@ from kros.observer.estimator.rows import Design, bridged
 from kros.observer.simulate import Course
 
 
-def design(recordings, family="linear", settings=FEW):
-    ranges = {"position": (-3.0, 3.0), "u": (-3.0, 3.0)}
+def design(recordings, family="linear", settings=FEW, largest_input=3.0):
+    ranges = {"position": (-3.0, 3.0), "u": (-largest_input, largest_input)}
     channels = channels_of(LIFTING, (0,), ("u",), family, ranges, settings)
     return Design.of(channels, recordings, settings)
 
@@ -67,6 +67,19 @@ def test_a_bank_is_its_system():
         some = begin == k
         alone = bank.rows(np.vstack([one, v[k + 1 :]]), at[some] - k) - rows[at[some]]
         np.testing.assert_allclose(bank.restarted(v, first, begin, at)[some], alone, atol=1e-12)
+
+
+def test_a_fit_is_the_same_in_any_units_of_measure():
+    """Squares of an input in millionths are larger by a factor of 1e12, positions are not."""
+    recordings, _ = plant(units=2, spread=0.1)
+
+    def in_millionths(key):
+        batch = recordings.read(key)
+        return replace(batch, inputs=1e6 * batch.inputs)
+
+    same = design(replace(recordings, read=in_millionths), "products", largest_input=3e6)
+    (one,), (other,) = Readout.of([design(recordings, "products")]), Readout.of([same])
+    np.testing.assert_allclose(other.left_out, one.left_out, rtol=1e-6)
 
 
 def test_banks_of_families_are_parts_of_the_richer_one():

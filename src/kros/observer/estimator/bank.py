@@ -119,9 +119,9 @@ class Bank:
 
     def sizes(self, rms: Array) -> Array:
         """Return the sizes of entries, their RMS; for the start of its decay by the channel's: many start at rest."""
-        size, first, moving = rms.copy(), self.first, self.channels - 1
-        size[first] = np.outer(rms[first][moving :: self.channels], [*rms[:moving], 1.0]).ravel()
-        return np.maximum(size, ITERATED * size.max())
+        size, first, of_channel = rms.copy(), self.first, np.append(rms[: self.channels - 1], 1.0)
+        size[first] = np.outer(rms[first][self.channels - 1 :: self.channels], of_channel).ravel()
+        return np.maximum(size, ITERATED * np.where(of_channel, of_channel, 1.0)[self.channel])
 
     @property
     def first(self) -> slice:

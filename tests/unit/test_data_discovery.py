@@ -253,6 +253,18 @@ def test_time_in_other_units_is_converted_where_a_file_says_so_and_refused_where
     assert found.population.sample_period_s == 0.01
 
 
+def test_columns_are_found_by_name_in_files_that_have_more_of_them(tmp_path: Path):
+    """One file has a reference before a channel that rests everywhere, which is left out all the same."""
+    files = recordings()
+    for name, lines in files.items():
+        extra = ["target,torque", "rad,N m", *(f"{k % 7},0" for k in range(len(lines) - 2))]
+        first = 0 if name.endswith("motor2/run1.csv") else 1
+        lines[:] = [f"{line},{','.join(more.split(',')[first:])}" for line, more in zip(lines, extra, strict=True)]
+    found = discover(written(tmp_path, files))
+    assert [c.name for c in found.population.columns] == ["angle", "speed", "voltage"]
+    assert len(found.population.episodes) == 6
+
+
 def test_episodes_that_are_too_short_are_left_out_before_anything_is_computed(tmp_path: Path):
     files = recordings()
     del files["motor1/run1.csv"][62:]

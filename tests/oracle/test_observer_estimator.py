@@ -190,7 +190,7 @@ def test_a_reduction_keeps_its_digits_where_coefficients_cancel():
 
 def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     recordings, _ = plant(units=3, episodes=2, spread=0.3)
-    settings = FEW.model_copy(update={"parts": 2, "rows": 100_000})
+    settings = FEW.model_copy(update={"parts": 2, "rows": 100_000, "penalties": (1e-8,)})
     (readout,) = Readout.of([design(recordings, settings=settings)])
     key = recordings.keys[0]
     others = [k for k in recordings.keys if k.unit != key.unit and k.episode != key.episode]

@@ -74,7 +74,7 @@ class EstimatorSettings(Settings):
         gt=0,
         description="time after a start until the second readout counts below one percent, in the slowest lags",
     )
-    settled_share: float = Field(3e-4, gt=0, description="weight of the errors of `restart_share` for all other time")
+    settled_share: float = Field(3e-6, gt=0, description="weight of the errors of `restart_share` for all other time")
     gap_share: float = Field(
         3e-3,
         ge=0,

@@ -64,6 +64,13 @@ def test_conditions_groups_and_single_machines():
     )
     batches, _ = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
     assert re.search(batches, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
+    dates = [f"rig_{u}.0__20220815_trajectory_0{e}.csv" for u in "AB" for e in EPISODES]
+    dates += [f"rig_C.0__20230629-14333{e}_trajectory.csv" for e in EPISODES]  # in another order of words
+    stamps, _ = infer_names(dates)
+    assert [re.search(stamps, name).groupdict() for name in dates][::8] == [
+        {"unit": "A.0", "episode": "20220815_trajectory_01"},
+        {"unit": "C.0", "episode": "20230629-143333_trajectory"},
+    ]
     seals = ["K_N_1bar.csv", "K_N_3bar.csv", "NAP310_1bar.csv", "NAP310_3bar.csv", "rig__O-ring257_1bar.csv"]
     found = [re.search(infer_names(seals)[0], name).groupdict() for name in seals]
     assert [(m["unit"], m["condition"]) for m in found][1:] == [

@@ -141,11 +141,11 @@ def _by_place(columns: list[Names], folders: int, varying: Sequence[int], left: 
 
 
 def _share(labels: Sequence[Any], units: Sequence[Any]) -> str | None:
-    """Return what labels of units are: groups of them, or conditions that several have in common."""
+    """Return what labels of units are: groups of them, or conditions that two thirds have in common."""
     pairs, own, of = (len(set(words)) for words in (zip(labels, units, strict=True), labels, units))
     if pairs == of > own:
         return GROUP
-    return CONDITION if pairs > max(own, of) else None
+    return CONDITION if pairs > max(own, of, 2 * own * of / 3) else None
 
 
 def _contiguous(roles: Roles) -> Roles:

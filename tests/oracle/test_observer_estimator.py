@@ -16,7 +16,15 @@ from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
 from kros.evaluate.sensor import as_shown
 from kros.lifting import Lifting
-from kros.observer import EstimatorSettings, Observer, Recordings, Sensor, identify_estimator, run_observer
+from kros.observer import (
+    EstimatorSettings,
+    Observer,
+    Recordings,
+    SampleStatus,
+    Sensor,
+    identify_estimator,
+    run_observer,
+)
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
@@ -263,7 +271,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
 def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
     observer = exact[0].observer
     assert observer.bank is not None
-    bank = replace(observer.bank, half=np.full((1, 3), 1e12), reach=np.zeros(3))
+    bank = replace(observer.bank, half=np.full((1, 3), 1e12), reach=np.zeros(3), gate=np.full(1, np.inf))
     A, B, n = observer.A.copy(), observer.B.copy(), observer.lifting.n_states
     A[n - 6 : n], B[n - 6 : n] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses it linearly
     A[n - 3 : n, n - 3 : n] = np.eye(3)
@@ -277,6 +285,37 @@ def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
     size = np.abs(wanted[after, 0, :3]).max(axis=0)
     np.testing.assert_allclose(found[after, 0, :3] / size, wanted[after, 0, :3] / size, atol=1e-8)
     assert not np.allclose(found[101 : 100 + gap + 1, 0, :3], wanted[101 : 100 + gap + 1, 0, :3])
+
+
+@pytest.mark.parametrize("size", [0.02, 0.1, 1.0])
+def test_wrong_samples_are_taken_as_missing(motors, size):
+    observer, batch = motors
+    rng = np.random.default_rng(0)
+    wrong = rng.random((*batch.states.shape[:2], 1)) < 0.02
+    wrong[:100] = False
+    shift = size * np.abs(batch.states[..., :1]).max()
+    spikes = batch.states[..., :1] + np.where(wrong, shift, 0.0)
+    missing = np.where(wrong, np.nan, batch.states[..., :1])
+    found, status = run_with_status(observer, spikes, batch.inputs)
+    np.testing.assert_array_equal(found[..., :3], run_observer(observer, missing, batch.inputs))
+    assert (status[wrong[..., 0]] & SampleStatus.LIMIT).all()
+
+
+@pytest.mark.parametrize("fault", ["stuck", "shifted for good"])
+def test_a_sensor_that_is_wrong_for_long_is_believed_again_and_its_fault_forgotten(motors, fault):
+    observer, batch = motors
+    assert observer.bank is not None
+    y = np.concatenate([batch.states[..., :1]] * 6)  # jumps where a recording ends
+    u, begin = np.concatenate([batch.inputs] * 6), 300
+    if fault == "stuck":
+        y[begin : begin + 200] = y[begin]
+    else:
+        y[begin:] += 0.3 * np.abs(y).max()
+    found, wanted = run_observer(observer, y, u), run_observer(observer, y[-500:], u[-500:])
+    last = slice(-200, None)
+    size = np.abs(batch.states).max(axis=(0, 1))
+    assert (np.sqrt(np.mean((found[last] - wanted[last]) ** 2, axis=(0, 1))) < 0.05 * size).all()
+    assert observer.bank.patience < 500
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 0.9, 0.95])
@@ -475,7 +514,8 @@ def test_a_readout_of_its_own_counts_after_every_loss_until_no_delay_reaches_bac
         A, B = observer.A.copy(), observer.B.copy()
         share = np.array([1.0, factor, factor])[:, None]  # substitutes are the same: the position
         A[n - 9 : n - 6], B[n - 9 : n - 6] = share * A[:3], share * B[:3]
-        one = replace(observer, A=A, B=B, bank=replace(observer.bank, half=np.full((1, 3), 1e12)))
+        bank = replace(observer.bank, half=np.full((1, 3), 1e12), gate=np.full(1, np.inf))
+        one = replace(observer, A=A, B=B, bank=bank)
         runs.append(run_observer(one, y, batch.inputs)[last + 3 :, :, 1])
     (slow, fast), oldest = observer.bank.start_recovery, 0.1 * np.exp(5)
     since = np.arange(2, len(y) - last - 1)[:, None]

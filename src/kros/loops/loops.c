@@ -51,8 +51,9 @@ typedef struct {
     whole recorded;    /* first states; the last ones are those after a start, those from inputs alone, and how far apart they are; none */
     whole kinds;       /* of gaps: of all measurements, and of some */
     whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
+    whole patience;    /* measurements refused in a row, after which one is believed */
     const double *map;        /* (n + order, n_lifted + order + n_inputs + q) */
-    const double *y;          /* (samples, q, batch); none where nothing is measured */
+    double *y;                /* (samples, q, batch); none where nothing is measured; of filter banks NaN in the end where refused */
     const double *u;          /* (samples, m, batch) */
     const int32_t *measured;  /* (q) */
     const double *low;        /* (n + order): bounds; none */
@@ -61,9 +62,10 @@ typedef struct {
     double *column;           /* (columns, batch): x and c in their rows, moved on */
     double *past;             /* (batch, earlier), moved on */
     const double *reach;      /* (recorded) */
+    const double *gate;       /* (q) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
     const double *bank;       /* (3 kinds + 1, recorded, batch): half, recovery, longest age, recovery of a start */
-    double *gap;              /* (kinds recorded + q + 2 + q filters, batch): age, count, ages of the start and of a loss, ramps; moved on */
+    double *gap;              /* (kinds recorded + 2 q + 2 + q filters, batch): age, counts of missing and of refused, ages of the start and of a loss, ramps; moved on */
     double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
 
@@ -256,23 +258,32 @@ static vec counted(const relift_job *s, const vec *bank, const vec *gap, whole a
 
 /* Gaps of a filter bank, see kros.observer.filter_bank for the symbols: measurements and what stands for missing ones, into states; straight lines
    over gaps that end. */
-static void fill(const relift_job *s, const vec *bank, const vec *gap, vec *reg, vec *y, mask *missing, whole n, whole w)
+static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *y, mask *missing, whole n, whole w)
 {
     const whole r = s->filters, recorded = s->recorded, ages = s->kinds * recorded;
     const vec *from_inputs = reg + (n - 2 * recorded) * MOST;
     vec *offset = reg + (n - recorded) * MOST;
-    for (whole j = 0; j < s->q; j++)
-        for (whole v = 0; v < w; v++) {
+    for (whole v = 0; v < w; v++) {
+        vec *start = gap + (ages + 2 * s->q) * MOST + v;
+        const vec begun = 1.0 + *start * *start;
+        for (whole j = 0; j < s->q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
+            vec *refusals = gap + (ages + s->q) * MOST + row;
             const vec seen = y[row], count = gap[ages * MOST + row], held = from_inputs[i] + offset[i];
             const vec reach = (vec){0} + s->reach[s->measured[j]];
             const vec near = clipped(reg[i] - held, -reach, reach);
-            const mask lost = ~(seen - seen == 0.0), ends = ~lost & (count > 0.0);
+            const vec gone = 1.0 + count - *refusals, far = s->gate[j] * (gone * gone) * (begun * begun), further = far * (1.0 + *refusals);
+            const vec apart = either(seen > reg[i], seen - reg[i], reg[i] - seen);
+            const mask arrived = seen - seen == 0.0, refused = (apart > further) & (*refusals < (double)s->patience);
+            const mask lost = ~arrived | refused, ends = ~lost & (count > 0.0);
+            *start = either(~refused & (apart > far) & (*refusals > 0.0), (vec){0} + OLDEST, *start);
+            *refusals = either(refused, *refusals + 1.0, either(arrived, (vec){0}, *refusals));
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
-            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(ages + s->q + 2 + j * r + l) * MOST + v] * jump;
+            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(ages + 2 * s->q + 2 + j * r + l) * MOST + v] * jump;
             missing[row] = lost;
             reg[i] = y[row] = either(lost, held + near, seen);
         }
+    }
     for (whole i = 0; i < recorded; i++)
         for (whole v = 0; v < w; v++) {
             const whole at = i * MOST + v;
@@ -298,7 +309,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
         vec longest = {0}, shortest = (vec){0} + INFINITY;
         for (whole j = 0; j < q; j++) {
             const mask lost = missing[j * MOST + v];
-            vec *count = gap + (ages + j) * MOST + v, *of = gap + (ages + q + 2 + j * r) * MOST + v;
+            vec *count = gap + (ages + j) * MOST + v, *of = gap + (ages + 2 * q + 2 + j * r) * MOST + v;
             const int moves = any(lost | (*count > 0.0));
             *count = either(lost, *count + 1.0, (vec){0});
             longest = either(*count > longest, *count, longest);
@@ -315,7 +326,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
             }
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
-        vec *start = gap + (ages + q) * MOST + v, *loss = start + MOST;
+        vec *start = gap + (ages + 2 * q) * MOST + v, *loss = start + MOST;
         *loss = either(some, (vec){0} + OLDEST, *loss);
         const vec begun = level(either(*start > *loss, *start, *loss), (vec){0} + 1.0);
         *start *= bank[3 * ages * MOST + v];
@@ -347,7 +358,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + q + 2 + q * s->filters : 0;
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + 2 * q + 2 + q * s->filters : 0;
     const whole numbers = (3 * s->kinds + 2) * recorded;
     vec *bank = vectors(numbers), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
@@ -395,6 +406,10 @@ int kros_relift(const formulas *f, const relift_job *s)
                 }
             }
             if (recorded) fill(s, bank, gap, reg, y, (mask *)missing, n, w);
+            for (whole j = 0; j < q && recorded; j++) {
+                for (whole v = 0; v < w; v++) next[v] = either(((mask *)missing)[j * MOST + v], (vec){0} + NAN, y[j * MOST + v]);
+                scatter(s->y + (k * q + j) * batch + first, next, 1, lanes);
+            }
             for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
             for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
             evaluate(f, reg, lanes);

@@ -134,6 +134,7 @@ class ObserverData:
             ages = (min(2, q), *recorded)  # of gaps of all measurements and, of several, of some
             shapes = bank.start.shape, bank.half.shape, bank.recovery.shape, bank.reach.shape
             self._require("start, half, recovery and reach", shapes, ((n, rows + columns), ages, ages, recorded))
+            self._require("gate", bank.gate.shape, (q,))
             self._require("start_recovery", bank.start_recovery.shape, (2,))
             if not 0 <= bank.filters <= (most := n - 4 * recorded[0]) or K.D.any() or K.n_states:
                 raise DimensionError(

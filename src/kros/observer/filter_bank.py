@@ -24,11 +24,15 @@ It falls so that m is below one percent some of the slowest time constants after
 reaches back to a loss. Limits of the estimates hold before the fallback enters them, so that little of what is far away
 is left in long gaps.
 
-A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of
-states that are not measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so
-are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit
-ramp was run along, through the slopes of lifted functions at what stood for the measurement, and ``z`` is corrected by
-:math:`r (y - \hat y) / (g + 1)` after g samples. At a start without all measurements, inputs alone count until the
+A measurement is refused, and counts as missing, where it is further from its estimate than :math:`b (1 + g)^2 (1 + r)
+(1 + a_s^2)^2`, with b the gate, g and r the samples that were missing and refused before it, and :math:`a_s` the age of
+a start. After as many refused in a row as a start takes samples it is believed. When one is believed that is beyond
+this without r, a start begins: little is known then. A missing measurement is
+replaced by its estimate, at most a reach away from the fallback, and o of states that are not measured is no larger
+than theirs: what the filters see is bounded for any pattern of losses, and so are they. When a measurement returns, the
+gap is bridged by a straight line: the response r of the filters to a unit ramp was run along, through the slopes of
+lifted functions at what stood for the measurement, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g
+samples. At a start without all measurements, inputs alone count until the
 first sample that has them; there the filters z start again, and those of inputs, their estimate and its distance go on.
 """
 
@@ -52,11 +56,18 @@ class FilterBank:
     recovery: Array  # (1 or 2, n)
     reach: Array
     start_recovery: Array
+    gate: Array
 
     def __post_init__(self) -> None:
         kinds = {"start": "finite numbers", "half": "positive and finite", "reach": "finite and not negative"}
+        kinds["gate"] = "positive"
         shares = dict.fromkeys(("recovery", "start_recovery"), "shares between 0 and 1")
         floats(self, "Filter bank", **shares, **kinds)
+
+    @property
+    def patience(self) -> int:
+        """Samples that a start takes: after as many refused in a row a measurement is believed."""
+        return round(-5 / np.log(self.start_recovery[0]))
 
     @property
     def of_measurements(self) -> Flags:
@@ -95,13 +106,13 @@ class Gaps:
         self._A = A[self.filters, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
         self._most = np.where(self.hidden, bank.reach, np.inf)
-        self.take(np.zeros((bank.half.size + q + 2 + q * bank.filters, batch)))
+        self.take(np.zeros((bank.half.size + 2 * q + 2 + q * bank.filters, batch)))
 
     def take(self, state: Array) -> None:
-        """Go on from a state whose rows are ages, counts, ages of a start and of a loss, and ramps of all machines."""
+        """Go on from a state: ages, counts of missing and of refused, ages of a start and of a loss, and ramps."""
         n, q = self.bank.half.size, len(self.measured)
         self.state = state
-        age, self.count, self.start, ramp = np.split(state.T, [n, n + q, n + q + 2], axis=1)
+        age, self.count, self.refusals, self.start, ramp = np.split(state.T, np.cumsum([n, q, q, 2]), axis=1)
         self.age = age.reshape(len(age), *self.bank.half.shape)
         self.ramp = ramp.reshape(len(ramp), q, -1).swapaxes(1, 2)
 
@@ -119,6 +130,16 @@ class Gaps:
     def share(self) -> Array:
         """How much the fallback counts, (batch, n)."""
         return np.where(self.waiting[:, None], 1.0, level(self.age, self.bank.half).max(axis=1))
+
+    def gated(self, x: Array, y: Array) -> Array:
+        """Return measurements (batch, q), NaN in place of those that are too far from their estimates to be true."""
+        apart, waiting = abs(y - x[:, self.measured]), self.waiting[:, None]
+        far = self.bank.gate * (1 + self.count - self.refusals) ** 2 * (1 + self.start[:, :1] ** 2) ** 2
+        refused = (apart > far * (1 + self.refusals)) & (self.refusals < self.bank.patience) & ~waiting
+        believed = (apart > far) & (self.refusals > 0) & ~refused & ~waiting
+        self.start[believed.any(axis=1), 0] = OLDEST
+        self.refusals[...] = np.where(np.isfinite(y), refused * (self.refusals + 1), self.refusals)
+        return np.where(refused, np.nan, y)
 
     def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
@@ -178,6 +199,8 @@ class Gaps:
             "kinds": len(bank.half),
             "filters": bank.filters,
             "reach": bank.reach,
+            "gate": bank.gate,
+            "patience": bank.patience,
             "limits": np.array(self.limits),
             "bank": np.repeat(rows[..., None], self.state.shape[1], axis=-1),
             "gap": self.state.copy(),

@@ -47,8 +47,8 @@ class SampleStatus(IntFlag):
     INVALID_INPUT
         An input is not finite. The last good value stood for it.
     LIMIT
-        A sample is beyond its limit or 1.5 times its range, or the estimate or the correction met a limit that is
-        declared.
+        A sample is beyond its limit or 1.5 times its range or was refused (see `filter_bank`), or the estimate or the
+        correction met a limit that is declared.
     UNCERTIFIED
         Outside what the observer is certified for: the innovation is beyond the envelope of the population (see
         `monitor`).

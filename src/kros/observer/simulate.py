@@ -197,7 +197,8 @@ def stepped(course: Course, samples: Screened) -> Stepped:
             followed[k] = values[loop.name]
             values[loop.name] = loop.step(steps, y, samples.u[k])
         taken[k] = moving[k] & ~steps.waiting
-        status[k][steps.waiting | (course.settling > 0)] = SampleStatus.RESTARTED
+        status[k][steps.refused] = SampleStatus.LIMIT
+        status[k][steps.waiting | (course.settling > 0)] |= np.uint8(SampleStatus.RESTARTED)
         course.settling = np.where(steps.waiting, settle, np.maximum(course.settling - 1, 0))
     return _finished(course, samples, Stepped(x, nu, status, starts, moving, followed), earlier, pending, taken)
 
@@ -210,10 +211,10 @@ def _compiled(loops: Library, course: Course, samples: Screened) -> Stepped | No
     first = min(d - int(late[0]), n_samples)  # which a measurement corrects
     begin, states = len(course.inputs) + first - d, np.empty((n_samples, steps.x.shape[1], batch))
     states[:first] = steps.x.T
-    lost = steps.gaps is not None and not np.isfinite(samples.y).all()
-    of_lifting = formulas(observer.lifting, course.values, u.shape[2], batch, observer.measured if lost else ())
+    entries, y = () if steps.gaps is None else observer.measured, samples.y[first:].swapaxes(1, 2).copy()
+    of_lifting = formulas(observer.lifting, course.values, u.shape[2], batch, entries)
     job = steps.job | {"samples": n_samples - first, "batch": batch, "states": states[first:]}
-    job |= {"y": samples.y[first:].swapaxes(1, 2), "u": u[begin : begin + n_samples - first].swapaxes(1, 2)}
+    job |= {"y": y, "u": u[begin : begin + n_samples - first].swapaxes(1, 2)}
     loops.call("kros_relift", of_lifting, ("relift_job", job))
     if job["left"]:
         return None
@@ -223,7 +224,9 @@ def _compiled(loops: Library, course: Course, samples: Screened) -> Stepped | No
     x, still = states.swapaxes(1, 2), np.zeros((n_samples, batch), dtype=bool)
     innovation = np.where(np.isfinite(samples.y), samples.y - x[..., q], 0.0)
     moving = np.broadcast_to(np.arange(n_samples)[:, None] >= first, still.shape)
-    run = Stepped(x, innovation, still.astype(np.uint8), still, moving, np.empty(0))
+    status, refused = still.astype(np.uint8), (np.isnan(y) & np.isfinite(samples.y[first:].swapaxes(1, 2))).any(axis=1)
+    status[first:][refused] = SampleStatus.LIMIT
+    run = Stepped(x, innovation, status, still, moving, np.empty(0))
     pending = np.broadcast_to(late[:, None], still.shape)
     return _finished(course, samples, run, np.empty((n_samples, batch, 0)), pending, moving)
 

@@ -25,6 +25,7 @@ class Steps:
         self.past, self.fresh = np.zeros((batch, len(lifting.window.earlier))), np.ones(batch, dtype=bool)
         self._low, self._high = bounds(observer.guard, n, order)
         self.waiting = np.zeros(batch, dtype=bool)  # for a start: the next step would leave the bounds
+        self.refused = np.zeros(batch, dtype=bool)  # whether a measurement was too far from its estimate
         self.gaps: Gaps | None = None
         if observer.bank is not None:
             limits = observer.runtime.sides(len(observer.recorded))
@@ -62,6 +63,9 @@ class Steps:
         u = np.broadcast_to(u, (len(self.x), u.shape[-1]))
         if self.gaps is not None:
             self._begin_filters(y, u, self.gaps.waiting & ~missing.any(axis=1))
+            y = self.gaps.gated(self.x, y)
+            self.refused[:] = (np.isnan(y) & ~missing).any(axis=1)
+            missing = ~np.isfinite(y)
             self.gaps.fill(self.x, y, missing)
         y = np.where(missing, self.x[:, self._measured], y)  # what is predicted corrects nothing
         delays = self.past.shape[1] > 0

@@ -31,7 +31,11 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     by: dict[str, dict[str, Array]] = {
         "seen": {"measured": y, "inputs": u[: len(observer.inputs)]},
         "monitor": {"size": y},
-        "bank": {"start": x[: lifting.n_states, None] / np.concatenate([x, u]), "reach": x[: len(observer.recorded)]},
+        "bank": {
+            "start": x[: lifting.n_states, None] / np.concatenate([x, u]),
+            "reach": x[: len(observer.recorded)],
+            "gate": y,
+        },
         "guard": dict.fromkeys(("lower", "upper"), x[: lifting.n_states]),
         "runtime": dict.fromkeys(observer.runtime.by_state(), x[: lifting.n_states]),
     }

@@ -96,7 +96,7 @@ def identify_estimator(
 
     filters, fallback = reduced(readout, settings.order), fallback_of(blind, settings.order)
     observer, orders = observer_of(filters, fallback), (len(filters.A), len(fallback.A))
-    F, apart = distances(observer, recordings, settings, held)
+    F, apart, gate = distances(observer, recordings, settings, held)
     near = [i for i in measured if i not in held]
 
     def complete(one: Observer) -> Observer:
@@ -113,7 +113,7 @@ def identify_estimator(
     trials = [(trial(group), unseen) for group, unseen in readout.left_out_groups()]
     observer = complete(observer)
     assert observer.bank is not None
-    bank = with_gaps(observer.bank, trials, F, settings)
+    bank = replace(with_gaps(observer.bank, trials, F, settings), gate=gate)
     observer, states = replace(observer, bank=bank), lifting.states
 
     def by_state(values: Array) -> dict[str, float]:
@@ -236,7 +236,7 @@ def assembled(
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[:n] for end in design.recordings.ranges)
     ages = np.ones((min(2, len(at)), n))
-    gaps = FilterBank(r, start, ages, np.zeros_like(ages), high - low, np.exp(-5 / fades))
+    gaps = FilterBank(r, start, ages, np.zeros_like(ages), high - low, np.exp(-5 / fades), np.full(len(at), np.inf))
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import TINY, Array, Flags, Parameters
-from ..filter_bank import FilterBank, level, longest_age
+from ..filter_bank import OLDEST, FilterBank, level, longest_age
 from ..observer import Observer
 from ..simulate import Course
 from .rows import Recordings
@@ -120,17 +120,23 @@ def with_gaps(
 
 def distances(
     observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]
-) -> tuple[Array, Array]:
-    """Return by which matrix distances from estimates of inputs alone decay, and their RMS; `held` have no decay."""
+) -> tuple[Array, Array, Array]:
+    """Return by which matrix distances from estimates of inputs alone decay, their RMS, and the gates of measurements.
+
+    States that are `held` have no decay.
+    """
     n, at = len(observer.recorded), list(observer.measured)
     states, y, inputs, own = training(
         observer, recordings, settings.gap_samples, settings.gap_episodes, min(recordings.lengths)
     )
-    from_inputs = recorded_estimates(observer, y, inputs, own)[..., n:]
-    apart = states - from_inputs
+    estimates, from_inputs = np.split(recorded_estimates(observer, y, inputs, own), 2, axis=-1)
+    assert observer.bank is not None
+    apart, age = states - from_inputs, OLDEST * observer.bank.start_recovery[0] ** np.arange(len(y))[:, None, None]
+    largest = (abs(y - estimates[..., at]) / (1 + age**2) ** 2).max(axis=(0, 1))
+    gate = settings.gate * np.where(largest > 0, largest, np.inf)
     F = decay(apart, [i for i in range(n) if i not in at] or at)
     F[held], F[:, held] = 0.0, 0.0
-    return F, np.sqrt(np.mean(apart**2, axis=(0, 1)))
+    return F, np.sqrt(np.mean(apart**2, axis=(0, 1))), gate
 
 
 def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Parameters) -> Array:

@@ -115,6 +115,12 @@ class EstimatorSettings(Settings):
         description="distance that a missing measurement may have from the fallback, in RMS distances of recorded ones "
         "from what the inputs say",
     )
+    gate: float = Field(
+        5.0,
+        gt=0,
+        description="distance of a measurement from its estimate, in largest ones of training, from which it counts as "
+        "missing; more after a start and in a gap",
+    )
     gap_samples: int = Field(
         240_000, ge=100, description="samples on which losses are simulated in training, over all episodes"
     )

@@ -123,8 +123,8 @@ class Sample:
     """Moments of thinned rows of a bank, as triangles R (., p): a mean over rows is the sum of squares of R's."""
 
     rows: Array
-    restarts: Array  # what a start in the middle of an episode changes, and straight lines over lost measurements
-    elsewhere: Array  # what a first sample at another place changes
+    restarts: Array  # what a start in the middle of an episode changes
+    elsewhere: Array  # what a first sample at another place changes, and straight lines over lost measurements
     errors: Array  # what errors of measurements change, with their weights
 
     def of(self, columns: Whole) -> Sample:
@@ -222,7 +222,7 @@ class Design:
             if not self.channels.inputs_only:
                 lost = np.random.default_rng(settings.seed).random(len(y)) < 0.5
                 changes = self.seen(self.signals(batch, bridged(y, lost)), at) - rows
-                triangles.add("restarts", np.sqrt(settings.gap_share / settings.restart_share) * root * changes)
+                triangles.add("elsewhere", np.sqrt(settings.gap_share / settings.start_share) * root * changes)
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
                 triangles.add("errors", root * (self.seen(self.signals(batch, y + bias), at) - rows))
             weight += weights.sum()

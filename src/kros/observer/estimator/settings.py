@@ -60,7 +60,7 @@ class EstimatorSettings(Settings):
     )
     start_share: float = Field(
         0.2,
-        ge=0,
+        gt=0,
         description="weight of the errors that the first sample makes at another place, for the time after a start or "
         "a loss: rows with target zero, since machines start elsewhere than in recordings",
     )
@@ -74,12 +74,12 @@ class EstimatorSettings(Settings):
         gt=0,
         description="time after a start until the second readout counts below one percent, in the slowest lags",
     )
-    settled_share: float = Field(3e-6, gt=0, description="weight of the errors of `restart_share` for all other time")
+    settled_share: float = Field(3e-3, gt=0, description="weight of the errors of `restart_share` for all other time")
     gap_share: float = Field(
         3e-3,
         ge=0,
         description="weight of the errors that straight lines over lost measurements make, half of them, for the time "
-        "after a start or a loss; less for all other time, as `settled_share` is less than `restart_share`",
+        "after a start or a loss",
     )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"

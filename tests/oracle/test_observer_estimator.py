@@ -453,7 +453,7 @@ def from_rest(places: list[float], seed: int) -> tuple[Recordings, dict]:
 
 def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_too():
     lifting = Lifting(("position", "velocity"))
-    rng, settings = np.random.default_rng(3), {"delays": 16, "rows": 20_000, "start_share": 0.0}
+    rng, settings = np.random.default_rng(3), {"delays": 16, "rows": 20_000, "start_share": 1e-12}
     recordings, _ = from_rest(list(rng.uniform(-2, 2, 6)), 1)
     unseen = from_rest(list(rng.uniform(-2, 2, 4)), 2)[1]
     errors = []
@@ -494,7 +494,7 @@ def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well()
             batches[key] = batch_of(x[:, None] + 1e-5 * rng.standard_normal((400, 1, 2)), u[:, None], 0.01)
     recordings = Recordings.of([key for key in batches if key.episode != "5"], batches.__getitem__)
     errors = []
-    for shares in ({"start_share": 0.0, "restart_share": 1e-12}, {}):
+    for shares in ({"start_share": 1e-12, "restart_share": 1e-12}, {}):
         chosen = EstimatorSettings(delays=16, rows=20_000, **shares)
         lifting = Lifting(("position", "velocity"))
         observer = identify_estimator("e", lifting, (0,), ("u",), recordings, 0.01, settings=chosen).observer

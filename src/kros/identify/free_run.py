@@ -3,8 +3,6 @@
 The definition is the *local error* of the paper's section III: the lifted state always has the structure of a lifting.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

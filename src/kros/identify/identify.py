@@ -6,8 +6,6 @@ condition
 those of the condition that feeds synthesis --refined on free-run error--> koopman, linear, in their place
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

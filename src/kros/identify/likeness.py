@@ -1,7 +1,5 @@
 """Units and episodes with channels that are recorded otherwise than in most: in another unit, mirrored, or stuck."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

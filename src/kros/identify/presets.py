@@ -1,7 +1,5 @@
 """What follows from a plant and from formulas where nothing is declared."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Settings of identification: lifted functions, calibration of their parameters, regularisation and refinement."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator

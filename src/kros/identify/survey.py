@@ -3,8 +3,6 @@
 Population --survey--> Population that can be used, RecordingFacts
 """
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence

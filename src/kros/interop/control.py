@@ -3,8 +3,6 @@
 kros.core.StateSpace (a batch) ── to_control ──► control.StateSpace (a list) ── from_control ──► kros.core.StateSpace
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ One model is fitted to all rows, of whatever unit. A batch of units with a model
 is what `kros.data.Population` and the stages after it are for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Self
 

@@ -19,8 +19,6 @@ is left below, the best is the best of all: nothing is assumed about the populat
 so that few rounds are needed; each visits as many pairs as there are units, not their square.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

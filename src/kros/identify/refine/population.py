@@ -7,8 +7,6 @@ therefore measures the distance from the pooled model as the uncertainty does (`
 held-out training episodes: the strongest one whose error is as good as the best, however unlike the models are then.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

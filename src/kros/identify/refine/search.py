@@ -1,7 +1,5 @@
 """The one search for parameters: Gauss-Newton steps with Levenberg's damping, for many small problems side by side."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

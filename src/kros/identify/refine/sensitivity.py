@@ -16,8 +16,6 @@ F       : F_0, and behind it the columns of every F_d that the lifting reads, (n
 normal  : ``[J r]^T [J r]`` of every unit, (unit, n p + 1, n p + 1), over the residuals r = (x_data - x) / sigma
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np

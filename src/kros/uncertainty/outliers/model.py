@@ -18,8 +18,6 @@ units. Fewer than eight units decide nothing. All this compares estimates that a
 recorded for too little are left open before (`population`). What a score would have shown stands beside it (`score`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property

@@ -4,8 +4,6 @@ Beside a score stands what the unit would have to differ by to be flagged; where
 nothing is said about the unit instead of "ok".
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from dataclasses import dataclass, replace
 from enum import StrEnum

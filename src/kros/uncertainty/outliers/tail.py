@@ -16,8 +16,6 @@ Levels of lighter tails (normal, bounded, of two suppliers) exceed this less oft
 1) on the bound is the largest level. The search takes units out one at a time, from levels in dB (unit, frequency).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

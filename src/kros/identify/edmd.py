@@ -111,12 +111,9 @@ def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
     ([[0.9]], [[0.1]])
     """
     p = R.shape[-1] - n_lifted
-    alpha = np.asarray(alpha, dtype=float)
-    batch = np.broadcast_shapes(R.shape[:-2], alpha.shape)
-    parts = R[..., :p, :], np.sqrt(alpha)[..., None, None] * np.eye(p, R.shape[-1])
-    stacked = [np.broadcast_to(part, (*batch, p, R.shape[-1])) for part in parts]
-    triangle = qr_triangle(np.concatenate(stacked, axis=-2))
-    R11, R12 = triangle[..., :p, :p], triangle[..., :p, p:]
+    penalty = np.sqrt(alpha)[..., None, None] * np.eye(p, R.shape[-1])
+    triangle = qr_triangle(np.concatenate(np.broadcast_arrays(R[..., :p, :], penalty), axis=-2))
+    R11 = triangle[..., :p, :p]
     size = np.maximum(np.linalg.norm(R11, axis=-2), TINY)
     pivots = np.abs(np.diagonal(R11, axis1=-2, axis2=-1)) / size  # what is left of a column beside those before it
     if np.any(pivots < p * EPS):
@@ -126,7 +123,7 @@ def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
             f"EDMD: column {column} of the lifted data{where} depends on the others (relative pivot "
             f"{pivots.min():.1e}); remove the lifting function or input, excite it, or use alpha > 0."
         )
-    U = np.swapaxes(np.linalg.solve(R11, R12), -1, -2)
+    U = np.swapaxes(np.linalg.solve(R11, triangle[..., :p, p:]), -1, -2)
     return KoopmanMatrices(U[..., :n_lifted], U[..., n_lifted:])
 
 

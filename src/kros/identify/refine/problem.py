@@ -122,10 +122,9 @@ class RefinementProblem:
 
     def admissible(self, V: Array) -> Flags:
         """Return which models are finite and stable as linear systems."""
-        A = (V @ self.T.T)[..., : self.lifting.n_lifted]
-        finite = np.all(np.isfinite(A), axis=(-1, -2))
-        radius = spectral_radius(np.where(finite[..., None, None], A, 0.0))
-        return finite & (radius < 1 - self.options.margin)
+        A = self.matrices(V).A
+        finite = self.finite(A)
+        return finite & (spectral_radius(np.where(finite[..., None, None], A, 0.0)) < 1 - self.options.margin)
 
     def matrices(self, V: Array) -> KoopmanMatrices:
         """Return A and B of whitened parameters."""

@@ -148,19 +148,16 @@ def survey(
     return retained, facts
 
 
-def _marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
-    """Return digests of all that the samples of every group follow from; None where the recordings are in no file."""
+def _marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> Iterator[str | None]:
+    """Yield digests of all that the samples of every group follow from; None where the recordings are in no file."""
     read = source.recordings
     settings = [(name, value) for name, value in vars(read).items() if name != "places"]
     about = (source.channels, source.period_s, source.steps, source.gaps)
     stamp, how = lru_cache(stamp_of), digest_of(about, type(read).__name__, settings, declared)
-
-    def mark(keys: Sequence[EpisodeKey]) -> str | None:
+    for keys in groups:
         files = [read.file(read.places[key]) for key in keys]
         rows = [(key, read.places[key], stamp(f)) for key, f in zip(keys, files, strict=True) if f is not None]
-        return digest_of(how, rows) if len(rows) == len(keys) else None
-
-    return [mark(keys) for keys in groups]
+        yield digest_of(how, rows) if len(rows) == len(keys) else None
 
 
 def _facts(
@@ -176,7 +173,6 @@ def _facts(
     train, test = (tuple(k for s in splits.values() for k in getattr(s, name)) for name in _PARTS)
     digests, measured = {e.key: e.digest for e in episodes}, retained.measured
     of_states = np.array([e.course for e in episodes])[..., : len(retained.states)]
-    strange = odd([title(e.key) for e in episodes], retained.states, of_states)
     return RecordingFacts(
         identify_on=condition_of(population.select(part), options.identify_on),
         groups=groups,
@@ -184,7 +180,7 @@ def _facts(
         test=test,
         resolution={m: float(np.quantile([g.resolution[m] for g in read], 0.5, method="lower")) for m in measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
-        alerts=(*_unlike(retained, read, groups), *strange),
+        alerts=(*_unlike(retained, read, groups), *odd([title(e.key) for e in episodes], retained.states, of_states)),
         reserve=tuple(options.reserve),
         digests=tuple(digests[key] for key in train + test),
     )
@@ -226,13 +222,13 @@ def condition_of(population: Population, wanted: str | None) -> str:
 def _read_group(task: _Task) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
     (population, folder, on_nan), record, written = task, None, None
-    names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
+    episodes, resolution = list[_EpisodeFacts](), dict[str, float]()
 
     def episodes_in_turn() -> Iterator[tuple[EpisodeKey, Array, str]]:
         for key, values, digest in usable_episodes(population, on_nan):
             if not episodes:
                 resolution.update(_resolution(population, key, values))
-            recorded = values[:, : len(names)]
+            recorded = values[:, : len(population.channels)]
             episodes.append(_EpisodeFacts(key, digest, len(values), course(recorded), moments(recorded)))
             yield key, values, digest
 
@@ -248,8 +244,7 @@ def _resolution(population: Population, key: EpisodeKey, prepared: Array) -> dic
     """Return the smallest step of every measured channel, as recorded where samples are interpolated."""
     source, signals = population.source, dict(zip([c.name for c in population.columns], prepared.T, strict=True))
     if any(step.makes_even for step in source.steps):
-        recorded = source.recordings(key).values
-        for channel, column in zip(source.channels, recorded.T, strict=True):
+        for channel, column in zip(source.channels, source.recordings(key).values.T, strict=True):
             scaling = scaling_of(population.scaling, channel.name)
             signals[channel.name] = column * (scaling.factor / scaling.converted)
     return {name: smallest_step(signals[name]) for name in population.measured}
@@ -259,5 +254,5 @@ def smallest_step(signal: Array) -> float:
     """Return the smallest step between samples, the quantisation of a digital sensor; rounding where there is none."""
     signal = signal[usable(signal)]
     steps, floor = np.abs(np.diff(signal)), ITERATED * float(np.abs(signal).max())
-    smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
-    return smallest if np.isfinite(smallest) else floor
+    steps = steps[steps > floor]
+    return float(steps.min()) if steps.size else floor

@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..core import Array, Flags, IdentificationError, Storable, Work
+from ..core import Array, IdentificationError, Storable, Work
 from ..core.arrays import Texts as Texts
 from ..core.linalg import pieces
 from ..data import Population, split_episodes
@@ -125,7 +125,10 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
         return []
     constant = np.abs(np.diff(reference, prepend=reference[:1])) < spec.steady * top / len(reference)
     steady = constant & (np.abs(reference) > spec.least_speed * top)
-    per_reference = _speed_per_reference(angle, reference / top, steady) / (dt * top)
+    moving = steady[:-1] & steady[1:]
+    relative = reference[:-1][moving] / top
+    power = float(relative @ relative)
+    per_reference = float(relative @ np.diff(angle)[moving]) / power / (dt * top) if power else 0.0
     edges = np.flatnonzero(np.diff(steady, prepend=False, append=False))
     segments = []
     for start, stop in zip(edges[::2] + round(spec.settle * len(reference)), edges[1::2], strict=True):
@@ -134,14 +137,6 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
         if stop - start >= spec.least_periods * period and period > spec.least_samples:
             segments.append(Segment(speed, _error_phase(spec.ratio * angle[start:stop], -measured[start:stop])))
     return segments
-
-
-def _speed_per_reference(angle: Array, reference: Array, steady: Flags) -> float:
-    """Change of the angle in a sample over the reference, zero where nothing moves."""
-    moving = steady[:-1] & steady[1:]
-    speed = reference[:-1][moving]
-    power = float(speed @ speed)
-    return float(speed @ np.diff(angle)[moving]) / power if power else 0.0
 
 
 def _error_phase(turn: Array, error: Array) -> float:
@@ -157,14 +152,12 @@ def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitP
     rows = []
     remaining = sorted(segments, key=lambda s: -abs(s.speed))
     while remaining:
-        speed = abs(remaining[0].speed)
-        group = [s for s in remaining if abs(s.speed) > (1 - spec.speed_tolerance) * speed]
+        group = [s for s in remaining if abs(s.speed) > (1 - spec.speed_tolerance) * abs(remaining[0].speed)]
         remaining = remaining[len(group) :]
         forward, reverse = ([s for s in group if (s.speed > 0) is ahead] for ahead in (True, False))
         if forward and reverse:
             (psi_f, r_f), (psi_r, r_r) = _circular_mean(forward), _circular_mean(reverse)
-            shares = min(r_f, r_r), min(len(forward), len(reverse))
-            rows.append(((psi_f + psi_r) / 2, (psi_f - psi_r) / 2, *shares))
+            rows.append(((psi_f + psi_r) / 2, (psi_f - psi_r) / 2, min(r_f, r_r), min(len(forward), len(reverse))))
     if not rows:
         ahead = sum(s.speed > 0 for s in segments)
         directions = {"forward": ahead, "reverse": len(segments) - ahead}

@@ -88,11 +88,10 @@ def identify(
     check_usable(population, test, identify_on, single_allowed=True)
     population, facts = survey(population, work, test=test, identify_on=identify_on, on_nan=on_nan)
     known = calibration if isinstance(calibration, PhaseCalibration) else None
-    declared = CalibrationSettings.of({} if known is not None else calibration or {}, "Calibrate")
+    declared = CalibrationSettings.of({} if known else calibration or {}, "Calibrate")
     if not isinstance(lifting, Lifting):
         lifting = resolve_lifting(lifting_settings(lifting), declared, population, test)
-    spec = resolve_phase(declared, population, lifting) if known is None else None
-    if spec is not None:
+    if known is None and (spec := resolve_phase(declared, population, lifting)):
         known = calibrate(population, facts, spec, work)
     return with_models(IdentifiedModels(population, facts, lifting, known), chosen, work)
 
@@ -114,8 +113,7 @@ def with_models(base: IdentifiedModels, settings: IdentifySettings, work: Work) 
     for condition, (recorded, models, refining) in begun.items():
         factors[condition] = recorded
         sets |= {base.place(m.name, condition): m for m in (*models, *refining())}
-    kinds = kinds_for(base.lifting, refined=settings.refine)
-    return replace(base, kinds=tuple(kinds), sets=sets, factors=factors)
+    return replace(base, kinds=tuple(kinds_for(base.lifting, refined=settings.refine)), sets=sets, factors=factors)
 
 
 def _begin(

@@ -12,8 +12,7 @@ from ..data.steps import longest_stretch
 
 def moments(values: Array) -> Array:
     """Return the covariance of channels and their changes in an episode (n_samples, c), shape (2 c, 2 c)."""
-    changes = np.diff(values, axis=0)
-    return np.cov(np.hstack([values[1:], changes]).T, bias=True)
+    return np.cov(np.hstack([values[1:], np.diff(values, axis=0)]).T, bias=True)
 
 
 def course(values: Array) -> Array:
@@ -100,8 +99,7 @@ def unlike(channels: Sequence[str], units: Mapping[str, Mapping[Any, Array]]) ->
                 sizes = {f"Unit {unit}": ratio[i, k]}
             much = "times as much as in most units; check its column and unit of measure."
             found += [f"{what}: {channels[k]} moves {of:.3g} {much}" for what, of in sizes.items()]
-        of_episodes = zip(episodes, mirrored, strict=True)
-        names = {title: " or ".join(channels[k] for k in of) for title, of in of_episodes if of}
+        names = {e: " or ".join(channels[k] for k in of) for e, of in zip(episodes, mirrored, strict=True) if of}
         if 2 * len(names) > len(episodes):  # most of them: the unit's sensor
             names = {f"Unit {unit}": name for name in names.values()}
         against = "moves against the other channels, unlike in most; check its sign."

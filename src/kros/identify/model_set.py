@@ -146,6 +146,6 @@ class ModelSet(Shown, Storable):
 
 def kinds_for(lifting: Lifting, *, refined: bool) -> dict[str, Lifting]:
     """Return the lifting of every kind of models, refined or by EDMD: without functions the linear one alone."""
-    has_functions, ending = bool(lifting.functions + lifting.input_functions), "" if refined else EDMD
-    lifted = {f"koopman{ending}": lifting} if has_functions else {}
+    ending = "" if refined else EDMD
+    lifted = {f"koopman{ending}": lifting} if lifting.functions + lifting.input_functions else {}
     return lifted | {f"linear{ending}": Lifting(lifting.states)}

@@ -30,8 +30,7 @@ def resolve_lifting(
     inputs, functions = declared.input_functions, declared.functions or ()
     if declared.functions is None and not declared.families and population.metadata.get("plant") == HARMONIC_DRIVE:
         functions = (f"sin({_ratio(calibration.ratio, population):g}*position + {PHASE})",)
-    sample = partial(_sample, population, test)
-    functions = sum((family(table, sample) for table in declared.families), functions)
+    functions = sum((family(table, partial(_sample, population, test)) for table in declared.families), functions)
     parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
     lifting = Lifting(population.states, functions, parameters, population.inputs, inputs)
     _ = lifting.separation, lifting.input_separation  # refused before anything is written

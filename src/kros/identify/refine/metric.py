@@ -105,8 +105,7 @@ def peak_residual(A: Array, B: Array, points: int = 200) -> float:
     """Return the peak of ``G^+ (G_nominal - G)`` for the nominal unit that makes it smallest, channels over ranges."""
     if len(A) < 2:
         return float("nan")
-    z = unit_circle(points)
-    G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
+    G = np.linalg.solve(unit_circle(points)[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
     inverse, G, every = entries_first(np.linalg.pinv(G)), entries_first(G), np.arange(points)  # (m, n, unit, frequency)
 
     def size(nominal: AnyArray, unit: AnyArray) -> AnyArray:

@@ -86,15 +86,17 @@ def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     """Refine in channels divided by their ranges."""
     count, longest = options.segments, max(options.horizons)
     segments = read_segments(data.population, data.keys, longest, count, options.seed, data.lifting.history)
-    fitted = segments.first(count - held_segments(count, data.keys))
-    start, problem = start_pooled(data, fitted, options)
+    start, problem = start_pooled(data, segments.first(count - held_segments(count, data.keys)), options)
     one_model = problem.of_one_model(data.rows)
     common = refine_pooled(start, one_model)
     pooled = problem.matrices(common)
     prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level)
     problem = replace(problem, sigma=normalised(one_model, common[None]), edged=True, prior=prior)
     path, scores = _path(data, problem, common)
-    choice = _choose(scores, options)
+    best = float(np.min(scores))
+    if not np.isfinite(best):
+        raise IdentificationError("Refinement: a free run over held-out training data diverges; use stronger priors.")
+    choice = int(np.argmax(scores <= (1 + options.tolerance) * best))  # the strongest prior about as good as the best
     strength = options.strengths[choice]
     log.info("prior of strength %g chosen, held-out score %.4g", strength, scores[choice])
     final = replace(problem, segments=segments).with_prior(strength)
@@ -134,14 +136,6 @@ def _fit(problem: RefinementProblem, V: Array, iterations: int) -> Array:
     """Fit every unit by itself; those that are done are not run on."""
     search = replace(problem.options.search, iterations=iterations)
     return search.minimise(problem.evaluate, problem.admissible, V, lambda rows: problem.of_units(rows).evaluate).V
-
-
-def _choose(scores: Array, options: RefineOptions) -> int:
-    """Return the strongest prior about as good as the best."""
-    best = float(np.min(scores))
-    if not np.isfinite(best):
-        raise IdentificationError("Refinement: a free run over held-out training data diverges; use stronger priors.")
-    return int(np.argmax(scores <= (1 + options.tolerance) * best))
 
 
 def start_pooled(data: TrainingData, segments: Segments, options: RefineOptions) -> tuple[Array, RefinementProblem]:

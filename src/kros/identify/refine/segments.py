@@ -94,8 +94,8 @@ def read_segments(
     population: Population, keys: Keys, horizon: int, count: int, seed: int, history: int = 0
 ) -> Segments:
     """Draw segments of every unit, those of its last episode at the end."""
-    n, width, length = len(population.states), len(population.channels), history + horizon + 1
-    values = np.empty((length, width, len(keys), count))
+    n, length = len(population.states), history + horizon + 1
+    values = np.empty((length, len(population.channels), len(keys), count))
     valid = np.empty((length, len(keys), count), dtype=bool)
     for row, (unit, episodes) in enumerate(keys.items()):
         if not episodes:
@@ -104,8 +104,7 @@ def read_segments(
         earlier, held = max(1, len(episodes) - 1), held_segments(count, keys)
         owners = np.array([*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held])
         for episode in dict.fromkeys(owners.tolist()):
-            key = episodes[episode]
-            samples = population.read(key)
+            samples = population.read(episodes[episode])
             for column in np.flatnonzero(owners == episode):
                 at = int(rng.integers(0, max(1, len(samples) - length + 1))) + np.arange(length)
                 values[..., row, column] = samples[np.minimum(at, len(samples) - 1)]

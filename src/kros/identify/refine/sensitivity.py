@@ -54,8 +54,7 @@ def normal_equations(
     W = np.repeat(np.moveaxis(V @ T.T, 0, -1), per_unit, axis=-1)  # (n, p, batch)
     x, u = segments.states.reshape(n_samples, n, batch), segments.inputs.reshape(n_samples, m, batch)
     window = lifting.windows(x[: h + 1].transpose(2, 0, 1), u[: h + 1].transpose(2, 0, 1))[:, 0].T.copy()
-    valid = segments.valid.reshape(n_samples, batch)
-    run = _Run(W, T, lifting, values, x, u, valid, sigma, stride, units)
+    run = _Run(W, T, lifting, values, x, u, segments.valid.reshape(n_samples, batch), sigma, stride, units)
     matrix, squares = np.zeros((units, width, width)), np.zeros((units, n))
     with np.errstate(over="ignore", invalid="ignore"):
         for J in run.rows(window):

@@ -72,7 +72,7 @@ def typical(squares: AnyArray) -> tuple[AnyArray, AnyArray]:
     column = (squares / row).max(axis=1, keepdims=True)
     column = np.where(column > 0, column, 1.0)
     weights = np.maximum(squares / row / column, OUTLIER.smallest)
-    left, right = np.ones(weights.shape[:2]), np.ones((weights.shape[0], weights.shape[2]))
+    left, right = np.ones(weights.shape[:2]), np.ones(weights.shape[::2])
     for _ in range(OUTLIER.balancings):
         left = (weights / right[:, None, :]).sum(axis=2)
         right = (weights / left[:, :, None]).sum(axis=1)

@@ -184,8 +184,7 @@ def score_outliers(
     G = G / scales[0][:, None] * scales[1]
     found = distances(form, G, freqs)
     parts = separate(found.levels, rate)
-    comparison = Comparison(form, G, freqs, found, parts.inliers, rate)
     inliers = np.flatnonzero(parts.inliers)
-    scores = comparison.scores(ids, parts.threshold_db, parts.margin_db)
+    scores = Comparison(form, G, freqs, found, parts.inliers, rate).scores(ids, parts.threshold_db, parts.margin_db)
     names = tuple(ids[k] for k in inliers)
     return OutlierModel(form, names, freqs, G[inliers], *scales, scores, parts.threshold_db, rate)

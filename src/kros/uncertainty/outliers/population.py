@@ -138,9 +138,8 @@ class Recorded:
 
     def response(self, evidence: Sequence[Evidence]) -> AnyArray:
         """Return responses of estimates, shape (estimate, frequency, n, m)."""
-        factors = [combine(e.lifted).R for e in evidence]
         sizes = np.sqrt([self.usual / e.n_samples for e in evidence])
-        fitted = self.models.fit(np.stack(factors) * sizes[:, None, None])
+        fitted = self.models.fit(np.stack([combine(e.lifted).R for e in evidence]) * sizes[:, None, None])
         return replace(self.models, A=fitted.A, B=fitted.B).responses(self.freqs_hz)
 
     def halves(self) -> tuple[AnyArray, AnyArray] | None:
@@ -164,10 +163,8 @@ class Recorded:
 
     def _moments(self, factor: Factor) -> AnyArray:
         """Return second moments of channels, as `likeness.moments` of episodes of which no changes are known."""
-        n, inputs = self.models.lifting.n_states, self._inputs
-        R = np.concatenate([factor.R[..., :n], factor.R[..., inputs]], axis=-1)
-        moments = R.swapaxes(-1, -2) @ R / factor.n_samples[:, None, None]
-        return np.pad(moments, ((0, 0), *2 * [(0, R.shape[-1])]))
+        R = np.concatenate([factor.R[..., : self.models.lifting.n_states], factor.R[..., self._inputs]], axis=-1)
+        return np.pad(R.swapaxes(-1, -2) @ R / factor.n_samples[:, None, None], ((0, 0), *2 * [(0, R.shape[-1])]))
 
     def same_motions(self, factor: Factor) -> bool:
         """Tell whether a unit was moved by inputs of the study alone."""

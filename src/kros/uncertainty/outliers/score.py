@@ -80,11 +80,11 @@ class Comparison:
         levels, scores = self.distances.levels, []
         excess, by_nominal = (excesses(v, self.inliers) for v in (levels.max(axis=1), self.distances.peaks))
         ends = np.array([np.nanmin(by_nominal, axis=0), np.nanmax(by_nominal, axis=0)]).T.tolist()
-        freqs, known = self.freqs_hz[levels.argmax(axis=1)], bool(np.isfinite(threshold))
+        known = bool(np.isfinite(threshold))
         for unit, (name, margin) in enumerate(zip(ids, margin_db.tolist(), strict=True), len(levels) - len(ids)):
             value = float(excess[unit])
             score_db = threshold + margin if known else value
-            beyond, hz = known and margin > 0, float(freqs[unit])
+            beyond, hz = known and margin > 0, float(self.freqs_hz[levels[unit].argmax()])
             score = OutlierScore(name, score_db, threshold, beyond, hz, value, *ends[unit])
             scores.append(self._detectable(score, unit, value - margin))
         return tuple(scores)

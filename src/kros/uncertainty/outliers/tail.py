@@ -28,7 +28,7 @@ LEAST_SCORES = 3
 
 def prediction_bound(scores: AnyArray, rate: float) -> AnyArray:
     """Return what one further score exceeds with probability `rate`, from scores of shape (..., score), dB."""
-    x = np.moveaxis(np.asarray(scores, float), -1, 0)
+    x = np.moveaxis(scores, -1, 0)
     if len(x) < LEAST_SCORES:
         return np.full(x.shape[1:], np.inf)
     return x.max(axis=0) + factor(len(x), rate) * scale(x)

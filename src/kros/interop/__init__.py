@@ -18,13 +18,12 @@ if TYPE_CHECKING:
 
 __all__ = ["KoopmanRegressor", "from_control", "to_control"]
 
-_HOME = dict.fromkeys(__all__, "control") | {"KoopmanRegressor": "sklearn_estimator"}
-
 
 def __getattr__(name: str) -> Any:
     """Import a bridge on first use (PEP 562)."""
-    if name in _HOME:
-        return getattr(import_module(f".{_HOME[name]}", __name__), name)
+    if name in __all__:
+        module = "sklearn_estimator" if name == "KoopmanRegressor" else "control"
+        return getattr(import_module(f".{module}", __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

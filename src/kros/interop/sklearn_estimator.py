@@ -84,10 +84,8 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             With ``alpha = 0``, a function or input that depends on the others or does not vary.
         """
         if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf:
-            problem = (
-                f"functions should be a list of texts and alpha at least zero, found {self.functions!r}, {self.alpha!r}"
-            )
-            raise ConfigError(f"KoopmanRegressor: {problem}.")
+            wanted = "functions should be a list of texts and alpha at least zero"
+            raise ConfigError(f"KoopmanRegressor: {wanted}, found {self.functions!r}, {self.alpha!r}.")
         X, y = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2)
         self._one_dimensional, after = y.ndim == 1, y.reshape(len(y), -1).astype(float)
         n, columns = after.shape[1], X.shape[1]

@@ -59,8 +59,7 @@ def load_observer(
     used = np.flatnonzero(~at_limit)
     visible = _visible(batch.take(used.tolist()), load[:, used], int(at_limit.sum()), settings)
     place = {key: i for i, key in enumerate(visible.keys)}
-    lengths = visible.lengths
-    recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
+    recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(visible.lengths[place[k]])))
     lag = settings.level_s / batch.sample_period_s
     estimator = EstimatorSettings(
         delays=settings.delays,

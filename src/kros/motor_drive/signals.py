@@ -36,8 +36,8 @@ def without_level(signal: ArrayLike, level_s: float, sample_period_s: float) -> 
     """Return the part of signals that can be seen: their change since the start, forgotten after `level_s`."""
     from scipy.signal import lfilter
 
-    signal, pole = np.asarray(signal, dtype=float), float(np.exp(-sample_period_s / level_s))
-    return lfilter([1.0, -1.0], [1.0, -pole], signal - signal[:1], axis=0)
+    signal = np.asarray(signal, dtype=float)
+    return lfilter([1.0, -1.0], [1.0, -np.exp(-sample_period_s / level_s)], signal - signal[:1], axis=0)
 
 
 def known_load(

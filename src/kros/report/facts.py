@@ -139,8 +139,7 @@ class Facts:
         for (condition, name, channel), units in grouped(rows, place).items():
             cell = _cell(units, known.get((condition, name, channel), ()))
             tables.setdefault(condition, {}).setdefault(name, {})[channel] = cell
-        home = self.study["identify_on"]
-        ordered = sorted(tables, key=lambda condition: (condition != home, natural_key(condition)))
+        ordered = sorted(tables, key=lambda condition: (condition != self.study["identify_on"], natural_key(condition)))
         return [ErrorTable(condition, tables[condition], self.measured) for condition in ordered]
 
     @cached_property

@@ -58,6 +58,5 @@ def _encode(figure: Figure, kind: str) -> bytes:
         if (engine := figure.get_layout_engine()) is not None:  # once: every file would lay it out again
             engine.execute(figure)
             figure.set_layout_engine(None)
-        dots = DRAWING.dots_per_inch
-        figure.savefig(buffer, format=kind, dpi=dots, transparent=kind == "svg", metadata=unstated)
+        figure.savefig(buffer, format=kind, dpi=DRAWING.dots_per_inch, transparent=kind == "svg", metadata=unstated)
     return buffer.getvalue()

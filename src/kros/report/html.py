@@ -32,8 +32,7 @@ def render(run: Path, metrics: ByName, mapped: Mapped = map, out: Path | None = 
     conditions = filter(None, map(condition_label, facts.study["conditions"]))
     subtitle = " · ".join([f"{facts.study['units']} units", *conditions])
     name = read_json(run / "study.json").get("name", run.name)
-    text = filled(name, subtitle, parts[0], evidence=parts[1], figures=figures, head=judge(facts))
-    write_bytes(path, text.encode())
+    write_bytes(path, filled(name, subtitle, parts[0], evidence=parts[1], figures=figures, head=judge(facts)).encode())
     return path
 
 
@@ -41,10 +40,8 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
     """Return a page of sections; `parts` are a summary, more sections as evidence, and figures by name."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    light = "".join(f"{t.variable}:{t};" for t in Tone)
-    dark = "".join(f"{t.variable}:{t.dark};" for t in Tone)  # the tones of the figures, for light and dark pages
-    loader, strict = FileSystemLoader(_TEMPLATES), StrictUndefined
-    pages = Environment(loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True)
+    loader = FileSystemLoader(_TEMPLATES)
+    pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     shown: Record = {
         "head": None,
         "evidence": (),
@@ -52,8 +49,8 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
         "name": name,
         "subtitle": subtitle,
         "sections": sections,
-        "light": light,
-        "dark": dark,
+        "light": "".join(f"{t.variable}:{t};" for t in Tone),  # the tones of the figures, for light and dark pages
+        "dark": "".join(f"{t.variable}:{t.dark};" for t in Tone),
     }
     return pages.get_template("report.html.jinja").render(shown | parts)
 
@@ -61,5 +58,4 @@ def filled(name: str, subtitle: str, sections: Sequence[Section], **parts: Any) 
 def encoded(run: RunFolder, name: str) -> Drawn:
     """Draw a figure as the page shows it."""
     drawn = draw(name, run)
-    svg = "" if drawn.figure is None else to_svg(drawn.figure, name, drawn.title)
-    return replace(drawn, svg=svg, figure=None)
+    return replace(drawn, svg="" if drawn.figure is None else to_svg(drawn.figure, name, drawn.title), figure=None)

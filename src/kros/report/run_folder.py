@@ -75,8 +75,7 @@ class RunFolder:
     @property
     def hidden(self) -> list[int]:
         """Columns of the states that are not measured; of all states where all are."""
-        columns = [i for i, c in enumerate(self.states) if not c.measured]
-        return columns or list(range(len(self.states)))
+        return [i for i, c in enumerate(self.states) if not c.measured] or list(range(len(self.states)))
 
     @property
     def sample_period_s(self) -> float:

@@ -94,8 +94,7 @@ def csv_text(rows: Rows) -> str:
 def html_text(rows: Rows) -> str:
     """Return a page with a table of units and conditions."""
     columns = [Column(name) for name in ("unit", "condition", "verdict", "reason")]
-    section = Section("units", "Units", tables=[build("", columns, rows, prose=True)])
-    return filled("kros check", worst(rows), [section])
+    return filled("kros check", worst(rows), [Section("units", "Units", tables=[build("", columns, rows, prose=True)])])
 
 
 def junit_text(rows: Sequence[Record]) -> str:
@@ -106,8 +105,7 @@ def junit_text(rows: Sequence[Record]) -> str:
     for unit, (verdict, reasons) in units.items():
         case = ElementTree.SubElement(suite, "testcase", classname="kros.check", name=_printable(unit))
         if verdict in tags:
-            message = _printable("; ".join(reasons))
-            ElementTree.SubElement(case, tags[verdict], type=verdict.value, message=message)
+            ElementTree.SubElement(case, tags[verdict], type=verdict.value, message=_printable("; ".join(reasons)))
     ElementTree.indent(suite)
     return ElementTree.tostring(suite, "utf-8", xml_declaration=True).decode()
 

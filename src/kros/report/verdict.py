@@ -264,11 +264,8 @@ def _of_certificates(facts: Facts) -> Checks:
     if facts.observers and all(label_of(name).baseline for name in facts.observers):
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
     for fold, why in facts.get("left_out").get("failed", {}).items():
-        yield (
-            f"Fold {int(fold) + 1} of the units left out failed: {why}",
-            "Correct it, and run the study again.",
-            "left-out",
-        )
+        text = f"Fold {int(fold) + 1} of the units left out failed: {why}"
+        yield text, "Correct it, and run the study again.", "left-out"
 
 
 def undecided(rows: Sequence[ByName]) -> list[ByName]:

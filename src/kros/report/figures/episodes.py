@@ -59,9 +59,8 @@ def free_run(run: RunFolder) -> Captioned:
     if not shown.models:
         raise NotShownError("no model was simulated on the episode that is shown")
     lines = {model_label(n): (values, model_look(n)) for n, values in linear_first(shown.models).items()}
-    block = Block(episode_title(shown.key), shown, lines, range(len(run.states)))
     text = "Simulation from the first recorded state with the recorded inputs, without measurements."
-    return _figure(run, [block], text)
+    return _figure(run, [Block(episode_title(shown.key), shown, lines, range(len(run.states)))], text)
 
 
 def estimates(run: RunFolder, paper: bool = False) -> Captioned:
@@ -88,10 +87,9 @@ def other_condition(run: RunFolder) -> Captioned:
         raise NotShownError("the recordings have one condition only")
     pair = observer_pair(published(shown.observers))
     names = pair or observer_pair(shown.observers, run.deployed)
-    block = _observed(episode_title(shown.key), shown, names, range(len(run.states)))
     text = _PAPER if pair else ""
     text += f"Designed in “{condition_label(run.facts.identify_on)}” alone; errors are recorded minus estimated values."
-    return _figure(run, [block], text)
+    return _figure(run, [_observed(episode_title(shown.key), shown, names, range(len(run.states)))], text)
 
 
 def paper_estimates(run: RunFolder) -> Captioned:
@@ -105,8 +103,7 @@ def load_torque(run: RunFolder) -> Captioned:
     if content is None:
         raise NotShownError("this study declares no load; set load.moment")
     shown = Shown.load(run.folder / "load")
-    ways = {"load": "load state", "current": "error of the recorded current"}
-    for way, label in ways.items():
+    for way, label in {"load": "load state", "current": "error of the recorded current"}.items():
         estimates = {n: values for n, values in shown.observers.items() if n.endswith(f"/{way}")}
         lines = {model_label(n.partition("/")[0]): (values, model_look(n)) for n, values in estimates.items()}
         blocks += [Block(label, shown, lines, [0], "declared load")] if lines else []
@@ -117,8 +114,7 @@ def load_torque(run: RunFolder) -> Captioned:
 
 
 def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[int]) -> Block:
-    lines = {observer_label(n): (shown.observers[n], observer_look(n)) for n in names}
-    return Block(title, shown, lines, states)
+    return Block(title, shown, {observer_label(n): (shown.observers[n], observer_look(n)) for n in names}, states)
 
 
 def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> Captioned:
@@ -138,9 +134,8 @@ def blocks_figure(
     for block in blocks:
         panels = axes[first : first + len(block.states)]
         first += len(block.states)
-        window = window_of(block.shown)
         for row, i in zip(panels, block.states, strict=True):
-            _draw_state(row, block, i, window)
+            _draw_state(row, block, i)
             row[3].set_ylabel(f"{squared(channels[i].unit)}/Hz", size="small")
             if band_hz is not None:
                 row[3].axvspan(*band_hz, color=Tone.GRID, lw=0, zorder=0.5)
@@ -154,9 +149,9 @@ def blocks_figure(
     return figure
 
 
-def _draw_state(row: Sequence[Axes], block: Block, i: int, window: slice) -> None:
+def _draw_state(row: Sequence[Axes], block: Block, i: int) -> None:
     """Draw one state of an episode in four panels."""
-    shown = block.shown
+    shown, window = block.shown, window_of(block.shown)
     time_s, recorded = shown.time_s, shown.states[:, i].astype(float)
     start = int(DRAWING.settled * len(recorded))
     for panel, part in ((row[0], slice(None)), (row[1], window)):

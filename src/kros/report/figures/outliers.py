@@ -36,9 +36,9 @@ def scores(run: RunFolder) -> Captioned:
 
 
 def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
-    places, highest = {u: i for i, u in enumerate(units)}, max(model.scores, key=lambda s: s.score_db)
+    highest = max(model.scores, key=lambda s: s.score_db)
     for score in model.scores:
-        tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
+        tone, place = Tone.ALARM if score.outlier else Tone.BLUE, units.index(score.unit)
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
         ends = score.lowest_db + shift, score.highest_db + shift
         axes.plot([place] * 2, ends, color=tone, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")

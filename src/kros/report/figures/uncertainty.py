@@ -73,9 +73,9 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
 def draw_forms(axes: Axes, model: UncertainModel) -> None:
     """Draw the bounds of all forms over frequency, the form in use thick."""
     for form, bound in model.bounds.items():
-        width, label = DRAWING.broad if form is model.form else None, words(form.value)
+        width = DRAWING.broad if form is model.form else None
         style = ":" if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else "-"  # it often hides output multiplicative
-        axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form], lw=width, label=label)
+        axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form], lw=width, label=words(form.value))
     axes.axhline(0, color=Tone.SOFT, lw=DRAWING.thin)
     frequency_axis(axes, model.freqs_hz)
 

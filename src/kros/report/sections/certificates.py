@@ -39,8 +39,7 @@ def certificates(facts: Facts) -> Section | None:
     assumed = facts.entry.get("assumptions")
     more = [f"“{facts.label}” at run time: {'; '.join(assumed)}."] if assumed else []
     card = [("Assumptions", [*_ASSUMED, *more]), ("How it is verified", _RECOMPUTED)]
-    tables = [_table(facts), _reasons(facts.observers)]
-    return Section("certificates", "Certificates", [_TEXT], card, tables)
+    return Section("certificates", "Certificates", [_TEXT], card, [_table(facts), _reasons(facts.observers)])
 
 
 def _table(facts: Facts) -> Table | None:

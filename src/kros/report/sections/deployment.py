@@ -33,8 +33,7 @@ def deployment(facts: Facts) -> Section | None:
         ("Monitor", _monitor(facts.entry.get("monitor"))),
     ]
     table = _needed(facts, entry)
-    texts = [_GAINS] if table is not None else []
-    return Section("deployment", "Deployment", texts, card, [table])
+    return Section("deployment", "Deployment", [_GAINS] if table else [], card, [table])
 
 
 def _needed(facts: Facts, entry: ByName) -> Table | None:

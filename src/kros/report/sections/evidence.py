@@ -67,8 +67,7 @@ def models(facts: Facts) -> Section | None:
     for channel, what in dict.fromkeys(key for row in rows for key in row if isinstance(key, tuple)):
         columns.append(Column(f"{what} (%)", (channel, what), words(channel), best=True))
     caption = "Simulation of held-out episodes from their first state, error in percent of the largest value"
-    table = build(caption, columns, rows)
-    return Section("models", "Models", [text], tables=[table], figure="free_run")
+    return Section("models", "Models", [text], tables=[build(caption, columns, rows)], figure="free_run")
 
 
 def spread(facts: Facts) -> Section | None:
@@ -91,8 +90,7 @@ def spread(facts: Facts) -> Section | None:
         for form in first["peak_db"]
     ]
     columns = [Column("form", note="used"), *(Column(f"{model_label(name)} (dB)", name) for name in entries)]
-    caption = "Peak residual, with the nominal unit that suits each form best"
-    table = build(caption, columns, rows, words(first["form"]))
+    table = build("Peak residual, with the nominal unit that suits each form best", columns, rows, words(first["form"]))
     return Section("spread", "Spread of the units", [text], tables=[table], figure="models")
 
 
@@ -124,8 +122,7 @@ def uncertainty(facts: Facts) -> Section | None:
 
 def run(facts: Facts) -> Section:
     """Return times, versions, and where the settings are."""
-    timing = facts.get("timing_s")
-    times = [{"stage": stage, "seconds": float(seconds)} for stage, seconds in timing.items()]
+    times = [{"stage": stage, "seconds": float(seconds)} for stage, seconds in facts.get("timing_s").items()]
     table = build("Time; a stage that was up to date counts in full", [Column("stage"), Column("seconds")], times)
     versions = [f"{name} {import_module(name).__version__}" for name in _PACKAGES]
     text = "metrics.json holds all numbers of this page, study.json all settings. Software: "

@@ -5,10 +5,8 @@ What was not run is absent, what is unknown is null, nothing is invented.
 
 from ..core import Record, load_artifact, plain
 from ..observer.sensor_gains import sensor_gains
-from ..uncertainty import UncertainModel
 from .config import Stage
 from .engine.context import Context
-from .engine.store import Store
 from .stages import left_out
 
 _PARTS = {"train": "train", "held_out": "test"}  # of the episodes
@@ -74,8 +72,7 @@ def _calibration(context: Context) -> Record:
     """What the phase of every unit belongs to; empty for a study without one."""
     if (calibration := context.calibration) is None:
         return {}
-    spec = calibration.spec
-    about = {key: getattr(spec, key) for key in ("ratio", "angle", "parameter")}
+    about = {key: getattr(calibration.spec, key) for key in ("ratio", "angle", "parameter")}
     return {"calibration": about | {"lag_rad": calibration.lag_rad}}
 
 
@@ -91,38 +88,28 @@ def _models(context: Context) -> Record:
 
 
 def _uncertainty(context: Context) -> Record:
-    """Uncertain models by kind, and the scores of all units."""
-    uncertain = context.uncertain
-    entries = {name: _uncertain_model(context.store, name, one) for name, one in uncertain.sets.items()}
+    """Uncertain models by kind with the share of noise in them, and the scores of all units."""
+    uncertain, store, entries = context.uncertain, context.store, dict[str, Record]()
+    for name, model in uncertain.sets.items():
+        orders = [model.weight.left_orders, model.weight.right_orders]
+        entries[name] = {
+            "form": model.form,
+            "nominal": model.nominal_id,
+            "peak_db": model.peak_db,
+            "misfit_max": model.misfit_max,
+            "weight": {"orders": orders, "cover_max": model.cover_max, "overbound_db_max": model.overbound_db_max},
+        }
+        if store.holds("uncertainty", name, "noise", "noise_share.json"):
+            facts, _ = load_artifact(store.path("uncertainty", name, "noise"), "noise_share")
+            entries[name]["noise_share"] = {key: facts[key] for key in ("median", "at_peak", "peak_hz")}
     return {"uncertainty": entries, "outliers": uncertain.scores}
 
 
-def _uncertain_model(store: Store, name: str, model: UncertainModel) -> Record:
-    """Return the metrics of one uncertain model, and the share of noise in it."""
-    orders = [model.weight.left_orders, model.weight.right_orders]
-    entry: Record = {
-        "form": model.form,
-        "nominal": model.nominal_id,
-        "peak_db": model.peak_db,
-        "misfit_max": model.misfit_max,
-        "weight": {"orders": orders, "cover_max": model.cover_max, "overbound_db_max": model.overbound_db_max},
-    }
-    if store.holds("uncertainty", name, "noise", "noise_share.json"):
-        facts, _ = load_artifact(store.path("uncertainty", name, "noise"), "noise_share")
-        entry["noise_share"] = {key: facts[key] for key in ("median", "at_peak", "peak_hz")}
-    return entry
-
-
 def _observers(context: Context) -> Record:
-    """Observers with what their synthesis and certificates state, and what the deployed one reads."""
-    return {"observers": dict(context.observers_record["facts"]), "deployment": _deployment(context)}
-
-
-def _deployment(context: Context) -> Record:
-    """Return what the deployed observer reads, estimates and needs of its sensors."""
+    """Observers with what their synthesis and certificates state, and what the deployed one reads and needs of its sensors."""
     observer = context.deployed
     measured, sizes = observer.outputs, observer.about["largest_in_training"]
-    return {
+    deployment = {
         "measured": measured,
         "inputs": observer.inputs,
         "estimates": observer.recorded,
@@ -133,6 +120,7 @@ def _deployment(context: Context) -> Record:
         "sensor": observer.about["sensor"],
         "sensor_gains": sensor_gains(observer, sizes),
     }
+    return {"observers": dict(context.observers_record["facts"]), "deployment": deployment}
 
 
 def _evaluation(context: Context, metrics: Record) -> Record:

@@ -75,8 +75,7 @@ class DaskExecutor:
         from distributed.client import ClosedClientError
 
         tasks = list(tasks)
-        size = min(_LARGEST, -(-len(tasks) // _BATCHES))
-        batches = [tasks[part] for part in pieces(len(tasks), size)]
+        batches = [tasks[part] for part in pieces(len(tasks), min(_LARGEST, -(-len(tasks) // _BATCHES)))]
         try:
             futures = self.client.map(partial(run_batch, code_key(), function), batches, pure=False)
         except ClosedClientError as error:
@@ -117,14 +116,14 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
 @contextmanager
 def single_threaded() -> Iterator[None]:
     """Let processes that start now, and libraries for linear algebra that are loaded now, use one thread."""
-    saved = {name: os.environ.get(name) for name in _THREADS}
+    saved = {name: os.environ[name] for name in _THREADS if name in os.environ}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
         yield
     finally:
-        for name, value in saved.items():
+        for name in _THREADS:
             os.environ.pop(name, None)
-            os.environ.update({} if value is None else {name: value})
+        os.environ.update(saved)
 
 
 @contextmanager

@@ -139,8 +139,7 @@ class FieldRecordings:
         population = with_gaps(open_data(context.config, data, hidden_states(observer)))
         check_channels(population, observer, hidden=False)
         chosen = parse_given(given, population.unit_ids, known)
-        home = context.facts.identify_on
-        values, sources, reasons = unit_values(population, context.calibration, home, chosen)
+        values, sources, reasons = unit_values(population, context.calibration, context.facts.identify_on, chosen)
         recordings = cls(observer, population, values, sources, track)
         recordings._settle(reasons)
         return recordings

@@ -133,5 +133,4 @@ def _one_line(text: str) -> str:
 def comment(text: str) -> list[str]:
     """Return a text as lines of comment."""
     later = "#   " if text.startswith("- ") else "# "
-    indents: Record = {"initial_indent": "# ", "subsequent_indent": later}
-    return textwrap.wrap(_one_line(text), 118, break_on_hyphens=False, **indents)
+    return textwrap.wrap(_one_line(text), 118, break_on_hyphens=False, initial_indent="# ", subsequent_indent=later)

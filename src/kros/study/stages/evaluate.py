@@ -63,9 +63,8 @@ def judged(context: Context, episodes: HeldOut, roles: Mapping[str, str]) -> tup
     names = [*makers, *(observer.name for group in groups for observer in group)]
     outcomes = dict(zip(names, chain.from_iterable(context.work.run("evaluate", work)), strict=True))
     outcomes = {name: outcomes[name] for name in (*context.observers_record["names"], *makers)}
-    baselines = {name: outcomes[name].facts for name in makers}
     rows = [row for item in outcomes.items() for row in episodes.rows(*item, roles)]
-    return outcomes, {"evaluation": rows, "baselines": baselines}
+    return outcomes, {"evaluation": rows, "baselines": {name: outcomes[name].facts for name in makers}}
 
 
 def of_baseline(episodes: HeldOut, make: Callable[[], Baseline]) -> list[Outcome]:
@@ -107,9 +106,8 @@ def held_out(context: Context, population: Population, keys: Keys, units: Values
 def showcase(context: Context, episodes: HeldOut) -> Keys:
     """Choose the episodes to display: nominal, worst off-nominal, and the nominal unit in every other condition."""
     home, uncertain = context.facts.identify_on, context.uncertain
-    others = sorted({k.condition for k in episodes.keys} - {home})
     wanted = [(uncertain.nominal, home), (uncertain.worst_off_nominal, home)]
-    wanted += [(uncertain.nominal, condition) for condition in others]
+    wanted += [(uncertain.nominal, condition) for condition in sorted({k.condition for k in episodes.keys} - {home})]
     groups = episodes.groups
     return tuple(groups[group][0] for group in dict.fromkeys(wanted) if group in groups)
 

@@ -47,9 +47,9 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
 
 def draw(config: StudyConfig, population: Population) -> Names:
     """Return the units in reserve, drawn from those that the study does not name, by their places alone."""
-    n, named = config.evaluate.reserve, set(config.load.units)
+    n = config.evaluate.reserve
     pooled = [u.id for u in population.units if u.group != OUTLIERS]
-    free = [u for u in pooled if u not in named]
+    free = [u for u in pooled if u not in config.load.units]
     if n and (n > len(free) or len(pooled) - n < FEWEST):
         there = f"there are {len(pooled)} units, {len(free)} not named by the study, and a population needs {FEWEST}"
         raise ConfigError(f"evaluate.reserve = {n}: {there}; reserve fewer.")
@@ -62,9 +62,8 @@ def run_read(context: Context) -> None:
     in_place, test = data.reader == PARQUET and not data.prepare, config.split.test
     copy = None if in_place else Copy(store.draft("recordings"), store.path("recordings"))
     population = open_source(config, context.given)
-    lifting = resolve_lifting(config.lifting, config.calibrate, population, test)
     options = {"identify_on": data.identify_on, "on_nan": data.on_nan, "reserve": draw(config, population)}
-    fewest = fewest_samples(lifting.history)
+    fewest = fewest_samples(resolve_lifting(config.lifting, config.calibrate, population, test).history)
     _, facts = survey(population, context.work, copy, test=test, fewest=fewest, **options)
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")
@@ -75,8 +74,7 @@ def run_read(context: Context) -> None:
 def run_calibrate(context: Context) -> None:
     """Calibrate the phase of every unit, where the lifting has one."""
     if (spec := context.phase_spec) is not None:
-        calibration = calibrate(context.population, context.facts, spec, context.work)
-        calibration.save(context.store.draft("calibration"))
+        calibrate(context.population, context.facts, spec, context.work).save(context.store.draft("calibration"))
 
 
 def run_identify(context: Context) -> None:

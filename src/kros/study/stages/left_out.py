@@ -93,10 +93,10 @@ def run_fold(whole: Context, number: int, units: Sequence[str]) -> Record:
 
 def without(whole: Context, held: Sequence[str]) -> StudyConfig:
     """Return the study on the prepared recordings of all other units."""
-    config, source = whole.config, recordings_path(whole.store.folder).absolute()
+    config = whole.config
     absent = [unit for unit in recordings_of(whole.store.folder).unit_ids if unit not in whole.facts.groups]
     changes = {
-        "source": source,
+        "source": recordings_path(whole.store.folder).absolute(),
         "reader": "parquet",
         "prepare": (),
         "csv": None,
@@ -104,8 +104,7 @@ def without(whole: Context, held: Sequence[str]) -> StudyConfig:
         "identify_on": whole.facts.identify_on,
     }
     data = config.data.model_copy(update=changes)
-    evaluate = config.evaluate.model_copy(update={"reserve": 0})
-    return config.model_copy(update={"data": data, "evaluate": evaluate})
+    return config.model_copy(update={"data": data, "evaluate": config.evaluate.model_copy(update={"reserve": 0})})
 
 
 def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None:
@@ -113,17 +112,16 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
     facts, population = whole.facts, whole.population.select(held)
     units = unit_parameters(population, context.calibration, facts.identify_on, facts)
     keys = tuple(k for k in facts.test if k.unit in held)
-    episodes = held_out(whole, population, keys, units)
-    _, content = judged(context, episodes, dict.fromkeys(held, FOLDER))
+    _, content = judged(context, held_out(whole, population, keys, units), dict.fromkeys(held, FOLDER))
     content["observers"] = {**context.observers_record["facts"], **content.pop("baselines")}
     save_artifact(context.store.draft("evaluation"), FOLDER, content)
 
 
 def next_unit(context: Context) -> Record:
     """Run the deployed observer on the units in reserve; return what their errors say about the next unit."""
-    facts, deployed, test = context.facts, context.observers_record["deployed"], context.config.split.test
+    facts, deployed = context.facts, context.observers_record["deployed"]
     population, home = recordings_of(context.store.folder).select(facts.reserve), facts.identify_on
-    splits = split_episodes(population, test).values()
+    splits = split_episodes(population, context.config.split.test).values()
     own = replace(facts, train=tuple(key for split in splits for key in split.train))
     values, _, failed = unit_values(population, context.calibration, home, facts=own)
     rows = []

@@ -68,10 +68,9 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> Record:
     curves, facts = {}, {}
     for name, make in makers.items():
         try:
-            curves[name], fact = make()
+            curves[name], facts[name] = make()
         except KrosError as error:
-            fact = {"status": "failed", "reason": str(error)}
-        facts[name] = fact
+            facts[name] = {"status": "failed", "reason": str(error)}
     shown = next(i for i, key in enumerate(trial.test.keys) if key.condition == TRIAL.condition)
     key, estimates = trial.test.keys[shown], {n: values[:, [shown]] for n, values in curves.items()}
     signals = trial.truth[1][:, [shown]], trial.test.inputs[:, shown]
@@ -160,7 +159,7 @@ class LoadTrial:
 
 def _truth(context: Context, batch: EpisodeBatch) -> Array:
     """Return the load that is declared, on episodes in its condition."""
-    config, place = context.config.load, context.population.states.index(TRIAL.angle)
-    position = batch.states[..., place]
+    config = context.config.load
+    position = batch.states[..., context.population.states.index(TRIAL.angle)]
     torque = known_load(position, batch.sample_period_s, config.moment or 0.0, config.inertia, TRIAL.corner_hz)
     return np.where([k.condition == TRIAL.condition for k in batch.keys], torque, 0.0)

@@ -163,7 +163,7 @@ def inputs_digest(context: Context) -> str:
     if given is not None:
         declared = (given.columns, given.sample_period_s, given.units, sorted(given.metadata.items()))
         return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
-    return digest_of([(str(f), *stamp_of(f)) for f in sorted(p for p in source.rglob("*") if p.is_file())])
+    return digest_of([(str(f), *stamp_of(f)) for f in sorted(source.rglob("*")) if f.is_file()])
 
 
 def _digest(given: Population, key: EpisodeKey) -> str:

@@ -12,6 +12,7 @@ counts, and nothing is removed from the run folder that the manifest does not li
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -112,8 +113,9 @@ class Store:
         """Move the draft of the running stage into the store, in place of one that is not whole, and name it."""
         draft = self.draft()
         draft.mkdir(exist_ok=True)
-        paths = sorted(path for path in draft.rglob("*") if is_file(path))
-        files = {path.relative_to(draft).as_posix(): describe(path) for path in paths}
+        files = {
+            path.relative_to(draft).as_posix(): describe(path) for path in sorted(draft.rglob("*")) if is_file(path)
+        }
         artefact = Artefact(digest, seconds, files, tuple(sorted(results)))
         artefact.save(draft)
         target = self.artefacts / digest
@@ -145,7 +147,8 @@ class Store:
             for name in artefact.files:
                 if artefact.matches(self.folder, name):
                     self.path(name).unlink()
-                    _prune(self.path(name).parent, self.folder)
+                    with suppress(OSError):  # those that have become empty
+                        os.removedirs(self.path(name).parent)
                 else:
                     log.info("%s: is not as kros wrote it, and stays", self.path(name))
         write_manifest(self.folder, manifest)
@@ -179,14 +182,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def _prune(folder: Path, root: Path) -> None:
-    """Remove folders that have become empty, up to a root."""
-    with suppress(OSError):
-        while folder != root:
-            folder.rmdir()
-            folder = folder.parent
 
 
 @cache

@@ -7,13 +7,9 @@ Entries are scaled by their typical size over all pairs, frequency by frequency 
 magnitudes), so that every row and column of the residual counts alike.
 """
 
-from __future__ import annotations
-
-from dataclasses import replace
-
 import numpy as np
 
-from ...core import AnyArray, Flags, frozen
+from ...core import AnyArray, frozen
 from ...core.linalg import pieces, sigma_max, squared
 from ..forms import Form, evenly, residual
 from ..settings import OUTLIER
@@ -28,11 +24,6 @@ class Distances:
     levels: AnyArray  # (unit, frequency), dB: smoothed singular value of the scaled residual, median over the nominals
     left: AnyArray  # (frequency, p'): typical size of the residual's rows
     right: AnyArray  # (frequency, m'): of its columns
-
-    def joined(self, levels: AnyArray) -> Distances:
-        """Return the distances with one more unit, whose levels (nominal, frequency) are known; it comes last."""
-        peaks = np.hstack([self.peaks, levels.max(axis=1)[:, None]])
-        return replace(self, peaks=peaks, levels=np.vstack([self.levels, np.median(levels, axis=0)]))
 
 
 def distances(form: Form, responses: AnyArray, freqs_hz: AnyArray) -> Distances:
@@ -50,7 +41,9 @@ def distances(form: Form, responses: AnyArray, freqs_hz: AnyArray) -> Distances:
 def _scaled(form: Form, G: AnyArray, nominals: AnyArray, itself: AnyArray) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Return singular values (nominal, unit, frequency) of residuals in units of their typical entries, and these."""
     E = np.stack([residual(form, G[k], G) for k in nominals])  # (nominal, unit, frequency, p', m')
-    E[_same(G, nominals)] = 0.0
+    size = np.abs(G).max(axis=(2, 3))
+    apart = np.stack([np.abs(G - G[k]).max(axis=(2, 3)) for k in nominals])
+    E[apart <= OUTLIER.smallest * np.maximum(size, size[nominals][:, None])] = 0.0  # equal but for rounding
     squares = squared(E[~itself])
     middle = np.median(squares, axis=0)
     equal = middle.max(axis=(1, 2)) == 0  # most pairs are
@@ -79,12 +72,6 @@ def typical(squares: AnyArray) -> tuple[AnyArray, AnyArray]:
     return np.sqrt(left * row[:, :, 0]), np.sqrt(right * column[:, 0])
 
 
-def balance(responses: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Return ranges of outputs and inputs from responses themselves."""
-    left, right = typical(np.median(squared(responses), axis=(0, 1))[None])
-    return left[0], 1 / right[0]
-
-
 def _nominals(G: AnyArray) -> AnyArray:
     """All units, or 64 spread evenly over their distances from the entrywise median."""
     if len(G) <= OUTLIER.nominals:
@@ -93,13 +80,6 @@ def _nominals(G: AnyArray) -> AnyArray:
     size = np.maximum(np.abs(middle), np.finfo(float).tiny)
     order = np.argsort((np.abs(G - middle) / size).mean(axis=(1, 2, 3)), kind="stable")
     return np.sort(order[evenly(len(G), OUTLIER.nominals)])
-
-
-def _same(G: AnyArray, nominals: AnyArray) -> Flags:
-    """Tell where nominal and unit are equal but for rounding, shape (nominal, unit, frequency)."""
-    size = np.abs(G).max(axis=(2, 3))
-    apart = np.stack([np.abs(G - G[k]).max(axis=(2, 3)) for k in nominals])
-    return apart <= OUTLIER.smallest * np.maximum(size, size[nominals][:, None])
 
 
 def _levels(sigma: AnyArray, freqs: AnyArray) -> AnyArray:

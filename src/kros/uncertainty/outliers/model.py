@@ -25,9 +25,10 @@ from functools import cached_property
 import numpy as np
 
 from ...core import AnyArray, ArrayLike, ConfigError, DataError, Names, Storable, frozen
+from ...core.linalg import squared
 from ..forms import Form, as_form, check_grid, check_responses, evenly
 from ..settings import OUTLIER
-from .distances import Distances, balance, distances, scaled_levels
+from .distances import Distances, distances, scaled_levels, typical
 from .score import Comparison, OutlierScore, Status
 from .tail import LEAST_SCORES, margins, separate
 
@@ -91,7 +92,9 @@ class OutlierModel(Storable):
         G = G / self.output_scale[:, None] * self.input_scale
         responses = self.responses[rows]
         known = self._known if len(rows) == len(self.unit_ids) else distances(self.form, responses, self.freqs_hz)
-        found = known.joined(scaled_levels(self.form, responses[known.nominals], G, known, self.freqs_hz))
+        levels = scaled_levels(self.form, responses[known.nominals], G, known, self.freqs_hz)
+        peaks = np.hstack([known.peaks, levels.max(axis=1)[:, None]])
+        found = replace(known, peaks=peaks, levels=np.vstack([known.levels, np.median(levels, axis=0)]))
         everyone, inliers = np.concatenate([responses, G[None]]), np.arange(len(rows) + 1) < len(rows)
         comparison = Comparison(self.form, everyone, self.freqs_hz, found, inliers, self.false_alarm_rate)
         beyond = margins(found.levels, inliers, self.false_alarm_rate)[1][-1:]
@@ -180,8 +183,9 @@ def score_outliers(
         raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.01 is usual.")
     rows = evenly(len(freqs), OUTLIER.frequencies)
     freqs, G = freqs[rows], G[:, rows]
-    scales = balance(G)
-    G = G / scales[0][:, None] * scales[1]
+    (left,), (right,) = typical(np.median(squared(G), axis=(0, 1))[None])
+    scales = left, 1 / right
+    G = G / left[:, None] * scales[1]
     found = distances(form, G, freqs)
     parts = separate(found.levels, rate)
     inliers = np.flatnonzero(parts.inliers)

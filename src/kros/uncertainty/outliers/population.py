@@ -111,10 +111,6 @@ class Evidence:
         """Samples of all episodes."""
         return int(self.factor.n_samples.sum())
 
-    def part(self, episodes: Sequence[int]) -> Evidence:
-        """Return some of the episodes."""
-        return Evidence(self.factor[list(episodes)], self.lifted[list(episodes)])
-
 
 @frozen
 class Recorded:
@@ -145,7 +141,7 @@ class Recorded:
     def halves(self) -> tuple[AnyArray, AnyArray] | None:
         """Return the responses of all units from every second episode, and from the others."""
         several = [e for e in self.units.values() if len(e.factor.R) > 1]
-        one, other = ([e.part(range(k, len(e.factor.R), 2)) for e in several] for k in (0, 1))
+        one, other = ([Evidence(e.factor[k::2], e.lifted[k::2]) for e in several] for k in (0, 1))
         return (self.response(one), self.response(other)) if several else None
 
     @property

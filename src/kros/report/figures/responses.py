@@ -1,7 +1,5 @@
 """Frequency responses: models of all units, and correction filters beside plant and weights."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ...core import AnyArray, StateSpace, grouped
@@ -13,8 +11,6 @@ from ..names import label_of, method_look, model_label, model_look, words
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING, Tone
 from .uncertainty import short
-
-Curve = tuple[str, AnyArray, str, str]
 
 
 def models(run: RunFolder) -> Captioned:
@@ -58,8 +54,17 @@ def filters(run: RunFolder) -> Captioned:
     chosen = grouped(robust, lambda name: split_name(name)[0])
     figure, axes = grid(1, len(chosen), sharey=True)
     for panel, (name, observers) in zip(axes[0], chosen.items(), strict=True):
-        freqs = run.models[name].frequencies(DRAWING.frequencies, decades=DRAWING.decades)
-        for label, response, colour, line in _curves(run, name, observers, freqs):
+        models, weight = run.models[name], run.uncertain[name].weight
+        freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
+        curves: list[tuple[str, AnyArray, str, str]] = [
+            ("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY, "-"),
+            ("W left", weight.left.frequency_response(freqs), Tone.GOLD, "-"),
+            ("W right", weight.right.frequency_response(freqs), Tone.GREEN, "--"),
+        ]
+        for observer in observers:
+            K, look = scaled_filter(run.syntheses[observer], models), method_look(observer)
+            curves.append((f"K {label_of(observer).text}", K.frequency_response(freqs), look.colour, look.style))
+        for label, response, colour, line in curves:
             size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
             if np.isfinite(size).any():  # not of a filter that is zero
                 panel.plot(freqs, size, line, color=colour, label=label)
@@ -69,20 +74,6 @@ def filters(run: RunFolder) -> Captioned:
     legend(max(axes[0], key=lambda panel: len(panel.lines)), 4)
     axes[0, 0].set_ylabel("largest singular value (dB)")
     return figure, "Every signal over its largest value. K maps the innovation to the correction."
-
-
-def _curves(run: RunFolder, name: str, observers: Sequence[str], freqs: AnyArray) -> list[Curve]:
-    """Return responses with their label, colour and style."""
-    models, weight = run.models[name], run.uncertain[name].weight
-    curves: list[Curve] = [
-        ("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY, "-"),
-        ("W left", weight.left.frequency_response(freqs), Tone.GOLD, "-"),
-        ("W right", weight.right.frequency_response(freqs), Tone.GREEN, "--"),
-    ]
-    for observer in observers:
-        K, look = scaled_filter(run.syntheses[observer], models), method_look(observer)
-        curves.append((f"K {label_of(observer).text}", K.frequency_response(freqs), look.colour, look.style))
-    return curves
 
 
 def scaled_filter(synthesis: Synthesis, models: ModelSet) -> StateSpace:

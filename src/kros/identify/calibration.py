@@ -236,14 +236,6 @@ def calibration_keys(facts: RecordingFacts, unit: str) -> Keys:
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
 
 
-def training_keys(population: Population) -> dict[tuple[str, str], Keys]:
-    """Return the episodes that a unit is identified on: its training part, or its only episode."""
-    groups = {(u, c): keys for u, c, keys in population.groups()}
-    several = tuple(k for keys in groups.values() if len(keys) > 1 for k in keys)
-    splits = split_episodes(replace(population, episodes=several))
-    return groups | {group: split.train for group, split in splits.items()}
-
-
 def unit_values(
     population: Population,
     calibration: PhaseCalibration | None,
@@ -258,7 +250,10 @@ def unit_values(
     known, sources, reasons = {u: dict((given or {}).get(u, {})) for u in population.unit_ids}, Texts(), Texts()
     if calibration is None:
         return known, sources, reasons
-    training, spec = training_keys(population), calibration.spec
+    spec, groups = calibration.spec, {(u, c): keys for u, c, keys in population.groups()}
+    several = tuple(k for keys in groups.values() if len(keys) > 1 for k in keys)
+    splits = split_episodes(replace(population, episodes=several)).items()
+    training = groups | {group: split.train for group, split in splits}  # or the only episode
     derived = "" if spec.measured in population.states else f" on the derivative of {spec.angle}"
     for unit, values in known.items():
         if spec.parameter in values:

@@ -115,7 +115,7 @@ def edmd(R: Array, n_lifted: int, alpha: ArrayLike = 0.0) -> KoopmanMatrices:
     triangle = qr_triangle(np.concatenate(np.broadcast_arrays(R[..., :p, :], penalty), axis=-2))
     R11 = triangle[..., :p, :p]
     size = np.maximum(np.linalg.norm(R11, axis=-2), TINY)
-    pivots = np.abs(np.diagonal(R11, axis1=-2, axis2=-1)) / size  # what is left of a column beside those before it
+    pivots = np.abs(np.linalg.diagonal(R11)) / size  # what is left of a column beside those before it
     if np.any(pivots < p * EPS):
         *unit, column = (int(i) for i in np.argwhere(pivots < p * EPS)[0])
         where = f" of unit number {unit[0]}" if unit else ""

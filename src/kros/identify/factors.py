@@ -154,7 +154,7 @@ def _widened(
     M = separation.matrix(parameters) if functions else np.zeros((0, len(separation.basis)))
     change = np.zeros((*peak.shape, n + M.shape[-2]))
     change[..., range(n), range(n)] = 1.0
-    change[..., n:, n:] = np.swapaxes(M, -1, -2)
+    change[..., n:, n:] = M.mT
     return change, np.concatenate([peak[..., :n], np.einsum("...ij,...j->...i", np.abs(M), peak[..., n:])], axis=-1)
 
 

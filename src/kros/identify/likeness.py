@@ -130,4 +130,4 @@ def _mirrored(units: Sequence[Array], c: int) -> list[list[list[int]]]:
 
 def _sizes(G: Array) -> Array:
     """Return the standard deviations of covariances (..., k, k), shape (..., k)."""
-    return np.sqrt(np.maximum(np.diagonal(G, axis1=-2, axis2=-1), TINY))
+    return np.sqrt(np.maximum(np.linalg.diagonal(G), TINY))

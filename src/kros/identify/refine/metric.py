@@ -91,7 +91,7 @@ class ResponsePrior:
         slope = self.weight * (1 + size) / size.shape[1]
         units, rows, columns = V.shape
         by_row = (adjoint(a) @ a) * slope[..., None, None]
-        by_column = Z.conj() @ np.swapaxes(Z, -1, -2)
+        by_column = Z.conj() @ Z.mT
         flat = by_row.reshape(*size.shape, -1).transpose(0, 2, 1), by_column.reshape(*size.shape, -1)
         form = (flat[0] @ flat[1]).real.reshape(units, rows, rows, columns, columns)
         H = form.transpose(0, 1, 3, 2, 4).reshape(units, rows * columns, -1)

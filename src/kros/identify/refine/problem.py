@@ -52,7 +52,7 @@ class OneStep:
         """
         p = len(T)
         white = np.concatenate([factor.R[..., :p] @ T, factor.R[..., p + n_states :]], axis=-1)
-        matrix = np.swapaxes(white, -1, -2) @ white / factor.n_samples[:, None, None]
+        matrix = white.mT @ white / factor.n_samples[:, None, None]
         mean = matrix[pooled].mean(axis=0)
         least = np.stack([_unexplained(M, p) for M in matrix])
         return cls(matrix, least, np.maximum(_unexplained(mean, p), least_variance * np.diagonal(mean[p:, p:])))
@@ -161,8 +161,8 @@ class RefinementProblem:
 
 def _unexplained(M: Array, p: int) -> Array:
     """Return the mean squares of functions that the best rows leave, from the matrix of all products."""
-    rows = np.linalg.lstsq(M[:p, :p], M[:p, p:], rcond=None)[0].T
-    return np.diagonal(M[p:, p:]) - np.sum(rows * M[:p, p:].T, axis=1)
+    best = np.linalg.lstsq(M[:p, :p], M[:p, p:], rcond=None)[0]
+    return np.diagonal(M[p:, p:]) - np.sum(best * M[:p, p:], axis=0)
 
 
 def _add(total: Array, part: Array, place: Whole) -> None:
@@ -179,8 +179,8 @@ def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
     excess = np.maximum(0.0, (size - 1 + guard) / guard)  # (problem, eigenvalue)
     left = np.linalg.pinv(right)  # rows y^H, with y^H x = 1
     turn = np.conj(values) / np.maximum(size, TINY)
-    columns = np.swapaxes(right, -1, -2) @ T[:n]  # x^T of every eigenvalue, through dA = dV T^T
+    columns = right.mT @ T[:n]  # x^T of every eigenvalue, through dA = dV T^T
     slope = (turn[..., None, None] * left[..., :, None] * columns[..., None, :]).real.reshape(problems, n, n * p)
     J = np.where(excess[..., None] > 0, slope / guard, 0.0)
     rows = np.sqrt(weight) * np.concatenate([J, -excess[..., None]], axis=-1)
-    return np.swapaxes(rows, -1, -2) @ rows
+    return rows.mT @ rows

@@ -93,7 +93,7 @@ def _step(matrix: Array, mu: Array) -> Array:
     fine = np.all(np.isfinite(matrix), axis=(1, 2))  # a run that diverges gives no direction
     H = np.where(fine[:, None, None], matrix[:, :-1, :-1], np.eye(matrix.shape[-1] - 1))
     g = np.where(fine[:, None], matrix[:, :-1, -1], 0.0)
-    diagonal = np.diagonal(H, axis1=1, axis2=2)
+    diagonal = np.linalg.diagonal(H)
     least = EPS**2 * diagonal.max(axis=1, keepdims=True) + TINY
     scale = 1 / np.sqrt(np.maximum(diagonal, least))
     scaled = H * scale[:, :, None] * scale[:, None, :] + mu[:, None, None] * np.eye(H.shape[-1])

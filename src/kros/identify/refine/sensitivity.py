@@ -58,7 +58,7 @@ def normal_equations(
     matrix, squares = np.zeros((units, width, width)), np.zeros((units, n))
     with np.errstate(over="ignore", invalid="ignore"):
         for J in run.rows(window):
-            matrix += J @ np.swapaxes(J, -1, -2)
+            matrix += J @ J.mT
             squares += (J[:, -1].reshape(units, -1, n, per_unit) ** 2).sum(axis=(1, 3)) * sigma**2
     matrix[~np.isfinite(matrix).all(axis=(1, 2))] = np.inf
     return Normal(matrix, squares, segments.compared[stride - 1 :: stride].sum(axis=(0, 2)).astype(float))

@@ -65,7 +65,7 @@ def filters(run: RunFolder) -> Captioned:
             K, look = scaled_filter(run.syntheses[observer], models), method_look(observer)
             curves.append((f"K {label_of(observer).text}", K.frequency_response(freqs), look.colour, look.style))
         for label, response, colour, line in curves:
-            size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
+            size = decibel(np.linalg.matrix_norm(response, ord=2))
             if np.isfinite(size).any():  # not of a filter that is zero
                 panel.plot(freqs, size, line, color=colour, label=label)
         panel.axhline(0, color=Tone.SOFT, lw=DRAWING.thin)

@@ -160,7 +160,7 @@ class Recorded:
     def _moments(self, factor: Factor) -> AnyArray:
         """Return second moments of channels, as `likeness.moments` of episodes of which no changes are known."""
         R = np.concatenate([factor.R[..., : self.models.lifting.n_states], factor.R[..., self._inputs]], axis=-1)
-        return np.pad(R.swapaxes(-1, -2) @ R / factor.n_samples[:, None, None], ((0, 0), *2 * [(0, R.shape[-1])]))
+        return np.pad(R.mT @ R / factor.n_samples[:, None, None], ((0, 0), *2 * [(0, R.shape[-1])]))
 
     def same_motions(self, factor: Factor) -> bool:
         """Tell whether a unit was moved by inputs of the study alone."""

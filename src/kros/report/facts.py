@@ -30,11 +30,6 @@ class ErrorCell:
     interval: Sequence[float] = ()  # 95 % interval of the mean, by a bootstrap over units
 
     @property
-    def worst_unit(self) -> str | None:
-        """Unit of the largest error."""
-        return max(self.errors, key=self.errors.__getitem__, default=None)
-
-    @property
     def worst(self) -> float | None:
         """Largest error of a unit."""
         return max(self.errors.values(), default=None)

@@ -109,7 +109,12 @@ def _numbers(facts: Facts) -> list[Number]:
             notes = [f"RMS {facts.quantity(channel, known['rms'])}"] if known.get("rms") else []
             if growth := facts.entry.get("left_out_to_training", {}).get(channel):
                 notes.append(f"in training {growth:.2f} times as large on units left out")
-            notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %", *_elsewhere(facts, channel)]
+            unit = max(cell.errors, key=cell.errors.__getitem__)
+            notes.append(f"worst unit {unit}: {number(cell.worst)} %")
+            worst, mean = _worst(facts, channel)
+            if worst != facts.table.condition:
+                size = "diverged" if mean == inf else f"{number(mean)} %"
+                notes.append(f"{condition_label(worst) or worst}: {size}")
             if error := known.get("true_error_percent"):
                 lag_s = known.get("true_lag_s", 0.0)
                 lag = f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}" if lag_s else ""
@@ -121,13 +126,6 @@ def _numbers(facts: Facts) -> list[Number]:
         notes = [some(flagged) or "none", *([f"UNDECIDED: {len(open_)} of {len(rows)} scores"] if open_ else [])]
         numbers.append(Number(str(len(flagged)), f"of {len({r['unit'] for r in rows})}", "units flagged", notes))
     return numbers
-
-
-def _elsewhere(facts: Facts, channel: str) -> list[str]:
-    """Return the mean error in the worst condition, if this is not that of the models."""
-    worst, mean = _worst(facts, channel)
-    error = "diverged" if mean == inf else f"{number(mean)} %"
-    return [] if worst == facts.table.condition else [f"{condition_label(worst) or worst}: {error}"]
 
 
 def _worst(facts: Facts, channel: str) -> tuple[str, float]:

@@ -106,7 +106,7 @@ def _uncertainty(context: Context) -> Record:
 
 
 def _observers(context: Context) -> Record:
-    """Observers with what their synthesis and certificates state, and what the deployed one reads and needs of its sensors."""
+    """Observers with what synthesis and certificates state, and what the deployed one reads and needs of sensors."""
     observer = context.deployed
     measured, sizes = observer.outputs, observer.about["largest_in_training"]
     deployment = {

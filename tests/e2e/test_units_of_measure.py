@@ -17,7 +17,7 @@ from kros.study import run as run_study
 from kros.study.config import Stage, validate_config
 
 CHANNELS = ("position", "velocity", "current", "voltage")
-WITHIN = 1e-5  # searches stop where they stop; 1 % is what is promised
+WITHIN = 3e-5  # the search for worst-case H2 stops where it stops: its bounds agree to 2e-6, errors, of which it sees none, to 1.6e-5
 
 
 @dataclass(frozen=True)

@@ -25,15 +25,16 @@ reaches back to a loss. Limits of the estimates hold before the fallback enters 
 is left in long gaps.
 
 A measurement is refused, and counts as missing, where it is further from its estimate than :math:`b (1 + g)^2 (1 + r)
-(1 + a_s^2)^2`, with b the gate, g and r the samples that were missing and refused before it, and :math:`a_s` the age of
-a start. After as many refused in a row as a start takes samples it is believed. When one is believed that is beyond
-this without r, a start begins: little is known then. A missing measurement is
-replaced by its estimate, at most a reach away from the fallback, and o of states that are not measured is no larger
-than theirs: what the filters see is bounded for any pattern of losses, and so are they. When a measurement returns, the
-gap is bridged by a straight line: the response r of the filters to a unit ramp was run along, through the slopes of
-lifted functions at what stood for the measurement, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g
-samples. At a start without all measurements, inputs alone count until the
-first sample that has them; there the filters z start again, and those of inputs, their estimate and its distance go on.
+(1 + a_s^2)^2`. Here b is the gate, g and r are the samples that were missing and refused just before, and :math:`a_s`
+is the age of a start. After as many refused in a row as a start takes samples, any measurement is believed. One that is
+further away than without r is a start: what was known before is of no use then.
+
+A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of states that are not
+measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so are they. When a
+measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit ramp was run along,
+through the slopes of lifted functions at what stood for the measurement, and ``z`` is corrected by :math:`r (y - \hat
+y) / (g + 1)` after g samples. At a start without all measurements, inputs alone count until the first sample that has
+them; there the filters z start again, and those of inputs, their estimate and its distance go on.
 """
 
 from __future__ import annotations

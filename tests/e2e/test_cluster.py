@@ -132,7 +132,8 @@ def wanted(study, tmp_path_factory):
 def left_in(out: Path) -> dict[str, bytes]:
     """All files of a run without the manifest and what artefacts hold, which say how long stages took; results of units are from workers."""
     files = [f for f in out.rglob("*") if f.is_file() and f.name not in ("manifest.json", "artefact.json")]
-    files = [f for f in files if not f.parent.name.startswith(TEMPORARY)]  # of a worker killed while it wrote: the next run removes it
+    # the next run removes what a worker was writing that was killed
+    files = [f for f in files if not f.parent.name.startswith(TEMPORARY)]
     found = {str(f.relative_to(out)): f.read_bytes() for f in files}
     metrics = json.loads(found.pop("metrics.json"))
     metrics.pop("timing_s")

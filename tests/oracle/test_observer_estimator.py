@@ -318,6 +318,18 @@ def test_a_sensor_that_is_wrong_for_long_is_believed_again_and_its_fault_forgott
     assert observer.bank.patience < 500
 
 
+def test_a_measurement_that_is_believed_after_refusals_begins_a_start(motors):
+    observer, batch = motors
+    y = np.repeat(batch.states[None, ..., :1], 2, axis=0)
+    y[1, 200:] += 0.05 * np.abs(y).max()
+    ages = []
+    for one in y:
+        course = Course(observer, one.shape[1])
+        course.take(one, batch.inputs)
+        ages.append(course.steps.gaps.start[:, 0])
+    assert (ages[1] > 10 * ages[0]).all()
+
+
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 0.9, 0.95])
 def test_any_pattern_of_losses_leaves_the_estimate_bounded_and_is_forgotten(motors, share):
     observer, batch = motors

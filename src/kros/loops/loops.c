@@ -272,7 +272,7 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
             const vec seen = y[row], count = gap[ages * MOST + row], held = from_inputs[i] + offset[i];
             const vec reach = (vec){0} + s->reach[s->measured[j]];
             const vec near = clipped(reg[i] - held, -reach, reach);
-            const vec gone = 1.0 + count - *refusals, far = s->gate[j] * (gone * gone) * (begun * begun), further = far * (1.0 + *refusals);
+            const vec missed = 1.0 + count - *refusals, far = s->gate[j] * (missed * missed) * (begun * begun), further = far * (1.0 + *refusals);
             const vec apart = either(seen > reg[i], seen - reg[i], reg[i] - seen);
             const mask arrived = seen - seen == 0.0, refused = (apart > further) & (*refusals < (double)s->patience);
             const mask lost = ~arrived | refused, ends = ~lost & (count > 0.0);

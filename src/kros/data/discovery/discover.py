@@ -16,7 +16,7 @@ from ...core import Array, ConfigError, DataError, Names, Record, Work, did_you_
 from ...core.arrays import Texts
 from ..measures import split_header
 from ..population import EpisodeKey, Population, Role
-from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, read_csv_folder
+from ..readers.csv_folder import ENDINGS, ChannelMapping, csv_files, position, read_csv_folder
 from ..readers.tables import Table, stretches
 from ..recording import CHECK, some, usable
 from ..steps import GAP
@@ -154,7 +154,7 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColum
         if len(samples) == len(spread):
             break
         with suppress(DataError):
-            values = table.numbers([_place(table, column) for column in columns])
+            values = table.numbers([position(table, c.reference, c.recorded) for c in columns])
             if len(values) >= CHECK.samples:
                 known = np.where(usable(values), values, np.inf)
                 first = np.append(True, (known[1:] != known[:-1]).any(axis=1))  # the others repeat the row before
@@ -163,12 +163,6 @@ def _sampled(source: Path, tables: Sequence[Table], columns: Sequence[TableColum
         tables[0].numbers(places)  # says why not, where it cannot be read
         raise DataError(f"Looking at {source}: the files have fewer than three rows of numbers; check the folder.")
     return next(iter(samples)), {at: [signals[i] for signals in samples.values()] for i, at in enumerate(places)}
-
-
-def _place(table: Table, column: TableColumn) -> int:
-    """Return where a column stands in a table, which may have further ones."""
-    names = [split_header(field)[0] for field in table.fields]
-    return names.index(split_header(column.header)[0]) if column.alone else column.at
 
 
 def _time(

@@ -250,7 +250,7 @@ def _episodes(
 ) -> Iterator[tuple[EpisodeKey, FilePlace]]:
     """Yield the episodes of a file, of which its name says some parts; `known` are units of measure of other files."""
     places = [(unit.suffix, _places(table, mapping, unit, known)) for unit in mapping.units]
-    columns = [table.texts(_position(table, column)) for column in mapping.labels.values()]
+    columns = [table.texts(position(table, column)) for column in mapping.labels.values()]
     for state, rows in stretches(columns) if columns else [((), slice(None))]:
         labels = dict(zip(mapping.labels, state, strict=True))
         parts = {"unit": "unit", "condition": DEFAULT_CONDITION, "episode": "0", **named, **labels}
@@ -314,7 +314,7 @@ def _places(
     if mapping.header and numbered:
         problem = f"one header line is needed, found numbers in the first line: {list(table.fields)}"
         raise DataError(f"Reading {table.path}: {problem}; put the names of the columns first, or set header = false.")
-    at = tuple(_position(table, *column) for column in wanted)
+    at = tuple(position(table, *column) for column in wanted)
     return at, tuple(_conversion(table, i, *column, known) for i, column in zip(at, wanted, strict=True))
 
 
@@ -343,7 +343,7 @@ def _named(fields: Names, column: Column, unit: str) -> list[int]:
     return places
 
 
-def _position(table: Table, column: Column, unit: str = "") -> int:
+def position(table: Table, column: Column, unit: str = "") -> int:
     """Return the position of a column, see `_named`."""
     places = _named(table.fields, column, unit)
     if len(places) == 1:

@@ -147,7 +147,7 @@ class Store:
             for name in artefact.files:
                 if artefact.matches(self.folder, name):
                     self.path(name).unlink()
-                    with suppress(OSError):  # those that have become empty
+                    with suppress(OSError):  # folders that have become empty; the run's own holds the manifest
                         os.removedirs(self.path(name).parent)
                 else:
                     log.info("%s: is not as kros wrote it, and stays", self.path(name))

@@ -1,4 +1,4 @@
-r"""Weights from residuals: a fit at few frequencies, a check at many, a proof at all.
+r"""Weights from residuals: a fit at the frequencies given, a check at many, a proof at all.
 
 All magnitudes of a diagonal weight are fitted together (`joint`): the orders and a first fit at some of the frequencies
 given, then once more at all, and at modes of units and residuals that these pass over. Which frequencies take part does
@@ -42,9 +42,10 @@ def fit_weight(
             raise DataError(f"Weights: {alike}; give frequencies at which they differ.")
         nothing = gain(np.zeros((p, p)), sample_period_s), gain(np.eye(m), sample_period_s)
         return Weight(*nothing, (0,) * p, (0,) * m, 0.0, 0.0), cover
-    problem, near = fit.problem(fit.few_hz())
+    few = fit.few_hz()
+    problem, near = fit.problem(few)
     fitted = fit_jointly(problem, near, max_order, tolerance_db)
-    every, _ = fit.problem(np.union1d(fit.few_hz(), fit.freqs_hz))
+    every, _ = fit.problem(np.union1d(few, fit.freqs_hz))
     weight = fit.weight(refit(every, fitted.sections, FIT.last_temperatures).sections)
     proof, ratio = fit.proven(weight)
     on_grid, left = float(ratio.max()), weight.left

@@ -17,7 +17,10 @@ from kros.study import run as run_study
 from kros.study.config import Stage, validate_config
 
 CHANNELS = ("position", "velocity", "current", "voltage")
-WITHIN = 3e-5  # the search for worst-case H2 stops where it stops: its bounds agree to 2e-6, errors, of which it sees none, to 1.6e-5
+WITHIN = 1e-9
+# Weights of what a form cannot represent are fitted to differences that are known to 1e-7 at low frequencies, and the
+# fit makes 1e-4 of that; nothing else is sensitive. Between two processors 6e-5 was seen.
+WEIGHTS, SENSITIVE = "worst_case_h2", 1e-3
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,11 @@ def errors(metrics):
     return found
 
 
+def within(observer):
+    """Relative difference that is rounding."""
+    return SENSITIVE if observer.endswith(WEIGHTS) else WITHIN
+
+
 @pytest.fixture(scope="module")
 def other(motors, tmp_path_factory):
     """Factors of many sizes, and the study in those units."""
@@ -84,7 +92,8 @@ def test_errors_scores_and_estimates_are_the_same(motors, first, other):
     expected, found = errors(one), errors(metrics)
     assert "filtered_difference" in {key[0] for key in found}
     assert found.keys() == expected.keys()
-    np.testing.assert_allclose(list(found.values()), [expected[key] for key in found], rtol=WITHIN)
+    for key, value in found.items():
+        assert value == pytest.approx(expected[key], rel=within(key[0])), key
     np.testing.assert_allclose(
         [r["score"] for r in metrics["outliers"]], [r["score"] for r in one["outliers"]], atol=1e-6
     )
@@ -98,7 +107,7 @@ def test_errors_scores_and_estimates_are_the_same(motors, first, other):
     by = dict(zip(CHANNELS, factors, strict=True))
     for row in metrics["evaluation"]:
         key = (row["observer"], row["unit"], row["channel"])
-        assert row["rms"] == pytest.approx(rms[key] * by[row["channel"]], rel=WITHIN)
+        assert row["rms"] == pytest.approx(rms[key] * by[row["channel"]], rel=within(row["observer"])), key
 
     y, u = (motors.read(motors.episodes[-1])[:, None, i : i + 1] for i in (0, 3))
     runs = [Observer.load(folder / "observers" / "deployed.json") for folder in (one_run, run)]

@@ -128,6 +128,7 @@ def _newton(smoothed: Callable[[AnyArray], tuple[AnyArray, AnyArray]], x: AnyArr
     step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
     step *= np.minimum(1.0, 2 / np.maximum(np.abs(step).max(axis=0), TINY))
     slope, length = (gradient * step).sum(axis=0), np.ones(x.shape[1])
-    while (rises := smoothed(x + length * step)[0] > cost + length * slope / 10).any() and length.min() > 1e-4:
+    highest = cost + 16 * EPS * (1 + np.abs(cost))  # a step that only rounding tells from a rise is a good one
+    while (rises := smoothed(x + length * step)[0] > highest + length * slope / 10).any() and length.min() > 1e-4:
         length = np.where(rises, length / 3, length)
     return x + np.where(rises, 0.0, length) * step

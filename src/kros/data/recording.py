@@ -179,21 +179,23 @@ def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], g
         raise DataError(f"{title(key)}: needs {len(channels)} channels, found an array of shape {values.shape}.")
     if len(values) < CHECK.samples:
         raise DataError(f"{title(key)}: needs at least {CHECK.samples} samples, found {len(values)}; leave it out.")
-    if not gaps and not usable(values).all():
+    if not gaps and not (usable(values.min(axis=0)) & usable(values.max(axis=0))).all():
         check_finite(values, key, channels, first=0)
-    resting = [is_constant(signal) for signal in values.T]
-    still = [i for i, c in enumerate(channels) if c.role is Role.STATE and resting[i]]
-    moving = [c.name for i, c in enumerate(channels) if still and not resting[i]]
+    rests = constant(values)
+    still = [i for i, c in enumerate(channels) if c.role is Role.STATE and rests[i]]
+    moving = [c.name for i, c in enumerate(channels) if still and not rests[i]]
     if moving:
         stays = f"state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples"
         reason = f"while {', '.join(map(repr, moving))} move, so its sensor is stuck or the column is wrong"
         raise DataError(f"{title(key)}: {stays} {reason}; leave the episode out, or the channel.")
 
 
-def is_constant(column: Array) -> bool:
-    """Tell whether a signal never changes, but for rounding."""
-    first, room = column[0], CHECK.constant * abs(column[0])
-    return bool(np.isfinite(first) and np.all((column >= first - room) & (column <= first + room)))
+def constant(values: Array) -> Flags:
+    """Tell which signals, shape (n_samples, n_channels), never change, but for rounding."""
+    known = np.isfinite(values[0])
+    first = np.where(known, values[0], 0.0)
+    room = CHECK.constant * np.abs(first)
+    return known & (values.min(axis=0) >= first - room) & (values.max(axis=0) <= first + room)
 
 
 def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int) -> None:
@@ -224,7 +226,7 @@ class GroupWatch:
         rows = [outside, len(values) // 2, len(values) - 1 - outside]
         quantiles = np.partition(values, rows, axis=0)[rows]
         at = np.abs(values - quantiles[1]).argmax(axis=0)
-        resting = np.where([is_constant(signal) for signal in values.T], values[0], np.nan)
+        resting = np.where(constant(values), values[0], np.nan)
         self._looks[key] = quantiles, np.ptp(values, axis=0), at, values[at, np.arange(len(at))], resting
 
     def wild(self) -> Iterator[tuple[EpisodeKey, str]]:

@@ -53,19 +53,21 @@ class ParquetRecordings(Recordings):
         place = self.places[key]
         path, (_, group, samples) = self.file(place), place
         options: Record = {"pre_buffer": False, "page_checksum_verification": True, "memory_map": True}
+        options["read_dictionary"] = list(KEYS)
         require_regular(path, sys.maxsize)
         try:
             with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:
                 table = file.read_row_group(group, columns=[*KEYS, *self.columns], use_threads=False)
             table.select(KEYS).validate(full=True)
-            labels = [table.column(name).unique().to_pylist() for name in KEYS]
+            chunks = [table.column(name).combine_chunks() for name in KEYS]
+            labels = [[*chunk.dictionary.to_pylist(), *[None] * chunk.null_count] for chunk in chunks]
             types = {str(table.schema.field(name).type) for name in self.columns}
             if (labels, types, len(table)) != ([[name] for name in astuple(key)], {"double"}, samples):
                 raise DataError(
                     f"Reading {path}: row group {group} should hold {samples} samples of {key} as double, found "
                     f"{len(table)} of {labels} as {', '.join(types)}; files were changed, {AGAIN}."
                 )
-            return Recording(key, np.column_stack([to_numpy(table.column(channel)) for channel in self.columns]))
+            return Recording(key, np.stack([to_numpy(table.column(channel)) for channel in self.columns]).T)
         except DataError:
             raise
         except Exception as error:  # what damaged files raise has no common base

@@ -226,5 +226,5 @@ def to_numpy(column: Any) -> Array:
     """Return the numbers of a float64 Arrow array, or of a column of chunks, NaN for nulls."""
     import pyarrow.compute as pc
 
-    filled = pc.fill_null(column, from_numpy(np.array([np.nan]))[0])
+    filled = pc.fill_null(column, from_numpy(np.array([np.nan]))[0]) if column.null_count else column
     return np.asarray(np.from_dlpack(filled.combine_chunks() if hasattr(filled, "chunks") else filled))

@@ -9,66 +9,11 @@ from slicot import partition, slicot_discrete
 
 from kros.core import StateSpace, hinf_norm
 from kros.synthesis import GeneralizedPlant, Status, h2, hinf
-from kros.synthesis.riccati.hinf_level import Frame
-
-CONTINUOUS_A = [
-    [-1, 0, 4, 5, -3, -2],
-    [-2, 4, -7, -2, 0, 3],
-    [-6, 9, -5, 0, 2, -1],
-    [-8, 4, 7, -1, -3, 0],
-    [2, 5, 8, -9, 1, -4],
-    [3, -5, 8, 0, 2, -6],
-]
-CONTINUOUS_B = [
-    [-3, -4, -2, 1, 0],
-    [2, 0, 1, -5, 2],
-    [-5, -7, 0, 7, -2],
-    [4, -6, 1, 1, -2],
-    [-3, 9, -8, 0, 5],
-    [1, -2, 3, -6, -2],
-]
-CONTINUOUS_C = [
-    [1, -1, 2, -4, 0, -3],
-    [-3, 0, 5, -1, 1, 1],
-    [-7, 5, 0, -8, 2, -2],
-    [9, -3, 4, 0, 3, 7],
-    [0, 1, -2, 1, -6, -2],
-]
-
-
-def slicot_sb10fd():
-    """Example of the SLICOT routine SB10FD (continuous H-infinity) at the level 15, with its controller."""
-    D = [[1, -2, -3, 0, 0], [0, 4, 0, 1, 0], [5, -3, -4, 0, 1], [0, 1, 0, 1, -3], [0, 0, 1, 7, 1]]
-    K = StateSpace(
-        [
-            [-2.8043, 14.7367, 4.6658, 8.1596, 0.0848, 2.5290],
-            [4.6609, 3.2756, -3.5754, -2.8941, 0.2393, 8.2920],
-            [-15.3127, 23.5592, -7.1229, 2.7599, 5.9775, -2.0285],
-            [-22.0691, 16.4758, 12.5523, -16.3602, 4.4300, -3.3168],
-            [30.6789, -3.9026, -1.3868, 26.2357, -8.8267, 10.4860],
-            [-5.7429, 0.0577, 10.8216, -11.2275, 1.5074, -10.7244],
-        ],
-        [
-            [-0.1581, -0.0793],
-            [-0.9237, -0.5718],
-            [0.7984, 0.6627],
-            [0.1145, 0.1496],
-            [-0.6743, -0.2376],
-            [0.0196, -0.7598],
-        ],
-        [[-0.2480, -0.1713, -0.0880, 0.1534, 0.5016, -0.0730], [2.8810, -0.3658, 1.3007, 0.3945, 1.2244, 2.5690]],
-        [[0.0554, 0.1334], [-0.3195, 0.0333]],
-        0.0,
-    )
-    return partition(CONTINUOUS_A, CONTINUOUS_B, CONTINUOUS_C, D, 2, 2, 0.0), K
 
 
 def scherer(C1, D12):
     """Example 7 of Scherer, Gahinet and Chilali, IEEE Trans. Automatic Control 42 (1997) 907."""
-    n_z = len(C1)
-    C = [*C1, [0, 1, 0]]
-    D = [*([0, d] for d in D12), [2, 0]]
-    assert len(D12) == n_z
+    C, D = [*C1, [0, 1, 0]], [*([0, d] for d in D12), [2, 0]]
     return partition([[0, 10, 2], [-1, 1, 0], [0, 2, -5]], [[1, 0], [0, 1], [1, 0]], C, D, 1, 1, 0.0)
 
 
@@ -119,20 +64,6 @@ def test_slicot_discrete_level():
     found = hinf(slicot_discrete())
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(111.294, abs=1e-3)
-
-
-def test_slicot_continuous_controller():
-    plant, published = slicot_sb10fd()
-    frame = Frame.of(plant)
-    central, _ = frame.solve(15.0)
-    assert hinf_norm(plant.close(central)) < 15
-    assert pytest.approx(published.D, abs=5e-5) == central.D
-    # The states are other ones; transfer functions compare. Four printed decimals of A leave about 1e-4 of its size.
-    freqs = np.array([0.01, 0.1, 0.5, 1.0, 3.0, 10.0])
-    error = central.frequency_response(freqs) - published.frequency_response(freqs)
-    size = np.linalg.norm(published.frequency_response(freqs), 2, axis=(-2, -1)).max()
-    assert np.linalg.norm(error, 2, axis=(-2, -1)).max() < 2e-3 * size
-    assert hinf_norm(plant.close(published)) == pytest.approx(hinf_norm(plant.close(central)), rel=2e-3)
 
 
 def test_scherer_example():
@@ -187,7 +118,7 @@ def test_normalised_coprime_factors(dt):
     # and size.
     rng = np.random.default_rng(7)
     solve = solve_discrete_are if dt > 0 else solve_continuous_are
-    for _ in range(15):
+    for _ in range(8):
         n, m, p = int(rng.integers(1, 9)), int(rng.integers(1, 4)), int(rng.integers(1, 4))
         A, B, C = rng.standard_normal((n, n)), rng.standard_normal((n, m)), rng.standard_normal((p, n))
         X, Z = solve(A, B, C.T @ C, np.eye(m)), solve(A.T, C.T, B @ B.T, np.eye(p))
@@ -203,7 +134,7 @@ def test_normalised_coprime_factors(dt):
 def test_slow_inequality_finds_the_same_optimum(dt):
     rng = np.random.default_rng(11)
     compared = 0
-    for _ in range(8):
+    for _ in range(5):
         plant = random_plant(rng, int(rng.integers(1, 4)), dt)
         slow, status = slow_optimum(plant)
         found = hinf(plant)
@@ -211,7 +142,7 @@ def test_slow_inequality_finds_the_same_optimum(dt):
         if status == "optimal":
             compared += 1
             assert found.hinf_norm == pytest.approx(slow, rel=1e-3)
-    assert compared >= 6
+    assert compared >= 4
 
 
 def test_static_optimum_is_parrotts():
@@ -269,3 +200,18 @@ def test_bounds_hold_in_all_coordinates(seed):
         )  # fmt: skip
         found.append(hinf(plant))
     assert max(f.lower_bound for f in found) <= min(f.hinf_norm for f in found) * (1 + 1e-5)  # where the search ends
+
+
+def test_close_solves_the_algebraic_loop():
+    rng = np.random.default_rng(8)
+    plant = GeneralizedPlant(
+        *(rng.standard_normal(s) for s in ((3, 3), (3, 2), (3, 1), (2, 3), (2, 3), (2, 2), (2, 1), (2, 2))),
+        0.3 * rng.standard_normal((2, 1)),
+        1.0,
+    )
+    K = StateSpace(*map(rng.standard_normal, ((2, 2), (2, 2), (1, 2), (1, 2))), 1.0)
+    freqs = np.array([0.01, 0.1, 0.37])
+    P, k = plant.open_loop().frequency_response(freqs), K.frequency_response(freqs)
+    P11, P12, P21, P22 = P[:, :2, :2], P[:, :2, 2:], P[:, 2:, :2], P[:, 2:, 2:]
+    expected = P11 + P12 @ k @ np.linalg.solve(np.eye(2) - P22 @ k, P21)
+    assert plant.close(K).frequency_response(freqs) == pytest.approx(expected)

@@ -12,7 +12,7 @@ from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, h2, mixed
 from kros.synthesis.mixed_norms.barrier import minimise
 from kros.synthesis.mixed_norms.inequalities import MixedInequalities
-from kros.synthesis.mixed_norms.mixed import by_inequalities, scaled, truncate, verify
+from kros.synthesis.mixed_norms.mixed import by_inequalities, scaled, verify
 from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.worst_case.certificate import certify_errors
 
@@ -95,9 +95,7 @@ def by_clarabel(inequalities):
     return cp.Problem(cp.Minimize(inequalities.objective() @ x), constraints).solve(solver="CLARABEL")
 
 
-@pytest.mark.parametrize(
-    ("seed", "order", "injection"), [(3, 5, Injection.INPUT), (3, 3, Injection.INPUT), (5, 1, Injection.STATE)]
-)
+@pytest.mark.parametrize(("seed", "order", "injection"), [(3, 4, Injection.INPUT), (5, 1, Injection.STATE)])
 def test_drive_like_observers_are_solved_and_certified(seed, order, injection):
     case = drive_problem(seed, injection, order)
     found = mixed(case)
@@ -138,18 +136,3 @@ def test_mixed_plant_with_dynamic_weights_on_both_sides():
     assert found[:, -3:-1, :2] == pytest.approx(right @ right, abs=1e-10)  # W_R W_u
     assert found[:, -3:-1, 3:5] == pytest.approx(right @ left, abs=1e-10)  # W_R W_L
     assert not np.abs(found[:, :3, :3]).any()
-
-
-def test_truncation_error_is_within_its_bound():
-    plant = mixed_plant(drive_problem(4, Injection.INPUT, 5))
-    small, tail = truncate(plant, 8)
-    full = plant.open_loop()
-    difference = StateSpace(
-        block_diagonal([full, small.open_loop()]).A,
-        np.vstack([full.B, small.open_loop().B]),
-        np.hstack([full.C, -small.open_loop().C]),
-        full.D - small.open_loop().D,
-        DT,
-    )
-    assert small.sizes[0] <= 8
-    assert hinf_norm(difference) <= 2 * tail * hinf_norm(full) * 1.01 + 1e-9 * hinf_norm(full)

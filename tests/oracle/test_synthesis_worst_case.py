@@ -4,12 +4,15 @@ hand."""
 import numpy as np
 import pytest
 from drives import DT, lag, servo
+from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
 
-from kros.core import block_diagonal, gain
+from kros.core import StateSpace, block_diagonal, gain, h2_norm
 from kros.synthesis import Injection, ObserverProblem, Status, worst_case_h2
 from kros.synthesis.worst_case.ball import Ball, dual_bound
 from kros.synthesis.worst_case.certificate import certify_errors, circle_mean, density
+from kros.synthesis.worst_case.worst_case_h2 import filters
+from kros.uncertainty import fit_magnitude
 
 
 def problem(seed=0, injection=Injection.STATE, **changes):
@@ -32,14 +35,6 @@ def problem(seed=0, injection=Injection.STATE, **changes):
         "injection": injection,
     }
     return ObserverProblem(**{**parts, **changes})
-
-
-def random_matrices(rng, m=2):
-    N = rng.standard_normal((m, m)) + 1j * rng.standard_normal((m, m))
-    N *= rng.uniform(0.1, 0.9) / np.linalg.norm(N, 2)
-    M = rng.standard_normal((m, m)) + 1j * rng.standard_normal((m, m))
-    T = rng.standard_normal((3, m)) + 1j * rng.standard_normal((3, m))
-    return N, M, T
 
 
 def contraction(x, m):
@@ -67,26 +62,9 @@ def test_the_set_is_a_matrix_ball_of_any_shape(shape):
         assert np.linalg.norm(X @ np.linalg.inv(np.eye(a) + N @ X), 2) <= 1 + 1e-9
 
 
-def test_bound_against_optimised_perturbations():
-    rng = np.random.default_rng(1)
-    ratios = []
-    for _ in range(10):
-        N, M, T = random_matrices(rng)
-        bound = Ball.of(N[None], M[None]).bound(T[None])[0]
-
-        def size(x, N=N, M=M, T=T):
-            delta = contraction(x, 2)
-            return -np.linalg.norm(T @ delta @ np.linalg.solve(np.eye(2) - N @ delta, M))
-
-        found = -min(minimize(size, rng.standard_normal(8), method="BFGS").fun for _ in range(2))
-        assert found <= bound * (1 + 1e-9)
-        ratios.append(bound / found)
-    assert max(ratios) < 1.05
-
-
 def test_dual_bound_against_optimised_contractions():
     rng = np.random.default_rng(5)
-    for m, p in ((1, 1), (1, 3), (2, 1), (2, 2), (2, 4), (3, 2), (3, 4)):
+    for m, p in ((1, 1), (1, 3), (2, 1), (2, 4), (3, 2)):
         a, P, Q = (
             (rng.standard_normal(s) + 1j * rng.standard_normal(s)) @ np.diag(10 ** rng.uniform(-1.5, 0, m))
             for s in ((p, m), (p, m), (m, m))
@@ -95,7 +73,7 @@ def test_dual_bound_against_optimised_contractions():
         def size(x, a=a, P=P, Q=Q, m=m):
             return -np.linalg.norm(a + P @ contraction(x, m) @ Q)
 
-        found = -min(minimize(size, rng.standard_normal(2 * m * m)).fun for _ in range(5))
+        found = -min(minimize(size, rng.standard_normal(2 * m * m)).fun for _ in range(3))
         bound = dual_bound(a[None], P[None], Q[None])[0]
         assert found * (1 - 1e-9) <= bound <= found * 1.05
         sizes = [np.linalg.svd(side, compute_uv=False) for side in (P, Q)]
@@ -185,8 +163,6 @@ def test_exact_when_the_set_is_a_scaled_identity():
     case = problem(2, W_L=gain(w * np.eye(2), DT), W_R=gain(np.eye(2), DT))
     found = worst_case_h2(case, max_order=0)
     A, B, C, W_p = case.scaled
-    from scipy.linalg import solve_discrete_are
-
     P = solve_discrete_are(A.T, C.T, (w / (1 - w)) ** 2 * B @ B.T, np.eye(1))
     L = np.linalg.solve(np.eye(1) + C @ P @ C.T, C @ P @ A.T).T
     optimum = certify_errors(case, case.error_system(case.to_physical(gain(L, DT))))
@@ -205,3 +181,28 @@ def test_remainder_enters_bound_and_design():
     assert found.worst_case_h2 > plain.worst_case_h2
     assert found.worst_case_h2 <= certify_errors(case, case.error_system(plain.controller)) * (1 + 1e-6)
     assert found.lower_bound <= found.worst_case_h2
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 1.7, np.pi])
+def test_a_certificate_sees_resonances_that_a_grid_passes_over(angle):
+    """A scalar perturbation of the input: the worst case is the norm of the plant, whose whole energy is in a band of a
+    ten-millionth of the range."""
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    A = (1 - 1e-7) * turn if np.sin(angle) > 1e-9 else np.diag([(1 - 1e-7) * np.cos(angle), 0.5])
+    nominal = StateSpace(A, [[0.5], [0.2]], np.eye(2), np.zeros((2, 1)), 1.0)
+    weights, scales = (gain([[0.01]], 1.0), gain([[1.0]], 1.0)), ([1.0], [1.0, 1.0], [0.1])
+    case = ObserverProblem(nominal, [[1.0, 0.0]], *weights, *scales, form="input_multiplicative")
+    nothing = gain(np.zeros((2, 1)), 1.0)
+    value = certify_errors(case, case.error_system(nothing))
+    assert value == pytest.approx(0.01 * h2_norm(nominal), rel=1e-4)
+
+
+def test_shaping_filters_touch_their_spectra_from_above():
+    freqs = np.geomspace(1e-3, 0.5 / DT, 400)
+    corner = freqs[:, None] / np.array([20.0, 3.0])
+    phi = np.array([4.0, 1e-6]) / (1 + corner**2) + np.array([0.01, 2e-9])
+    response = filters(phi, freqs, DT, 3, 0.5).frequency_response(freqs)
+    ratio = np.abs(np.diagonal(response, axis1=1, axis2=2)) ** 2 / phi
+    np.testing.assert_allclose(ratio.min(axis=0), 1.0, rtol=1e-9)
+    overbounds = [fit_magnitude(freqs, np.sqrt(c), DT, max_order=3, tolerance_db=0.5).overbound_db for c in phi.T]
+    np.testing.assert_allclose(10 * np.log10(ratio.max(axis=0)), overbounds, atol=0.05)

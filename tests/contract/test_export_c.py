@@ -134,14 +134,6 @@ def test_load_torque_with_its_level(precision, limit, tmp_path):
 
 @needs_compiler
 @pytest.mark.parametrize("precision", ["double", "float"])
-def test_a_thousand_turns_cost_no_accuracy(precision, tmp_path):
-    observer, (y, u) = replace(drive(), seen=None), samples(1500, turns=1000, faults=False)
-    found, _ = CompiledObserver.build(export_c(observer, tmp_path / "c", "drive", precision)).run(y, u)
-    assert apart(found, in_python(observer, y, u)[0]) < (1e-9 if precision == "double" else 1e-4)
-
-
-@needs_compiler
-@pytest.mark.parametrize("precision", ["double", "float"])
 def test_everything_compiles_without_a_warning(precision, tmp_path):
     folder = export_c(watched(drive(delay=2, **LIMITS)), tmp_path / "c", "drive", precision)
     size = 'extern int printf(const char *, ...);\n#include "drive.h"\nint main(void) { printf("%d", (int)sizeof(drive_state)); return 0; }\n'

@@ -33,21 +33,6 @@ def lifted_R(episodes, phase=0.7, model=LIFTING):
     return lifted_factor(batch, LIFTING, {"phase": np.array([phase])}, model)
 
 
-@pytest.mark.parametrize("alpha", [0.0, 1e-3, 1.0, 90.0])
-def test_equals_pykoop(alpha):
-    pykoop = pytest.importorskip("pykoop")
-    episodes = [simulate(seed, noise=0.01) for seed in range(4)]
-    rows = [
-        np.column_stack([np.full(len(x), float(i)), x, np.sin(3 * x[:, :1] + 0.7), u])
-        for i, (x, u) in enumerate(episodes)
-    ]
-    pipeline = pykoop.KoopmanPipeline(regressor=pykoop.Edmd(alpha=alpha))
-    pipeline.fit(np.vstack(rows), n_inputs=2, episode_feature=True)
-    expected = pipeline.regressor_.coef_.T
-    found = edmd(lifted_R(episodes).R[0], 3, alpha)
-    np.testing.assert_allclose(np.hstack([found.A, found.B]), expected, rtol=1e-9, atol=1e-9)
-
-
 def test_exact_system_is_recovered_to_rounding():
     found = edmd(lifted_R([simulate(0), simulate(1)]).R[0], 3)
     np.testing.assert_allclose(found.A[:2], A_TRUE, atol=1e-13)

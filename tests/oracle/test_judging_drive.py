@@ -31,16 +31,6 @@ def test_energy_is_what_enters_less_what_leaves(loaded):
     assert np.all(missing[1] < 0.4 * missing[0])
 
 
-def test_held_still_the_current_carries_the_mass():
-    p, angle = parameters(coulomb=0, stribeck=0, hysteresis_torque=1e-9), np.array([0.4, 1.5, -1.0])
-    targets = np.stack([np.broadcast_to(angle[:, None], (N, 3000)), np.zeros((N, 3000))])
-    position, _, current, _ = drive.run(p, np.ones(N), targets, 1.0)
-    physics = drive.Physics(p, np.ones(N), position[:, -1])
-    expected = (1 - physics.kinematic_error()[1]) * p["load_moment"] * np.sin(physics.ql) / p["torque_constant"]
-    np.testing.assert_allclose(current[:, -500:].mean(axis=1), expected, rtol=5e-3)
-    assert np.abs(position - angle[:, None]).max() < 1e-4
-
-
 def test_without_friction_error_and_gravity_it_is_a_linear_two_mass_system():
     p = parameters(coulomb=0, stribeck=0, hysteresis_torque=1e-12, error_1=0, error_2=0)
     physics = drive.Physics(p, np.zeros(N), np.zeros(N), 1e-5)

@@ -15,7 +15,6 @@ from kros.evaluate.sensor import as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, run_observer
 from kros.observer.certificate.error import error_system, state_sizes
-from kros.observer.certificate.signals import frozen_response
 from kros.synthesis import Injection
 
 DT = 0.01
@@ -89,19 +88,6 @@ def test_sizes_of_the_error_system_are_those_of_what_its_states_are(delay: int) 
     filters, behind = np.ones(2), [*np.tile(np.arange(1.0, window + 1), delay), 1.0, 2.0, 3.0] if delay else []
     np.testing.assert_array_equal(sizes, [*np.arange(1.0, window + 1), *filters, *behind])
     assert len(sizes) == len(system.A)
-
-
-def test_a_frozen_response_starts_at_the_first_error() -> None:
-    """Recursion by hand; the first states are where it starts unless a system says otherwise."""
-    system = error_system(observer(("0.3*sin(3*a)",)))
-    rng = np.random.default_rng(3)
-    w, first = rng.standard_normal((6, 2, 4)), rng.standard_normal((2, 3))
-    xi = np.concatenate([first, np.zeros((2, len(system.A) - 3))], axis=1)
-    expected = [xi @ system.C.T]
-    for k in range(6):
-        xi = xi @ system.A.T + w[k] @ system.B.T
-        expected.append(xi @ system.C.T)
-    np.testing.assert_allclose(frozen_response(system, w, first)[0], expected, rtol=1e-12, atol=1e-14)
 
 
 RUNTIMES = {"none": {}, "delay": {"delay": 3}, "limits": {"lower": np.full(3, -0.35), "upper": np.full(3, 0.35)}}

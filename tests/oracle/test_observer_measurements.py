@@ -9,7 +9,6 @@ from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.observer.baselines.difference import hold_missing
-from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.sensor_gains import sensor_gains
 from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
@@ -75,14 +74,6 @@ def test_an_observer_that_forgets_nothing_or_too_slowly_has_no_gains():
     assert sensor_gains(replace(slow, A=np.diag([1 - 1e-3, 0.9])), sizes)
 
 
-def test_losing_everything_is_the_open_loop():
-    x, u = plant(300)
-    phases = {"phase": np.linspace(0, 3, x.shape[1])}
-    (found,) = run_observers([observer(LIFTED)], lost(x, 1.0), u, phases)
-    (open_loop,) = run_observers([observer(LIFTED, 0 * L)], lost(x, 0.0), u, phases)
-    np.testing.assert_allclose(found, open_loop, rtol=1e-12, atol=1e-12)
-
-
 def test_many_observers_with_missing_samples_do_what_each_does_by_itself_sample_by_sample():
     x, u = plant(400)
     rng = np.random.default_rng(5)
@@ -105,21 +96,6 @@ def test_many_observers_with_missing_samples_do_what_each_does_by_itself_sample_
             nu = np.where(np.isfinite(y_k), y_k - x[:, :1], 0.0)
             x = (LIFTED.lift(x, phases) @ o.A.T + u_k @ o.B.T + x_c @ K.C.T + nu @ K.D.T)[:, :2]
             x_c = x_c @ K.A.T + nu @ K.B.T
-
-
-def test_the_extended_filter_without_measurements_is_the_kalman_recursion_without_its_update():
-    x, u = plant(80, 3)
-    Q, R, P0 = 0.01 * np.eye(2), np.array([[0.04]]), np.diag([0.04, 4.0])
-    y = lost(x, 0.4, seed=1)
-    found = ExtendedKalman(LINEAR, A, B, (0,), Q, R, P0).run(y, u)
-    for i in range(3):
-        state, P = np.array([y[0, i, 0], 0.0]), P0
-        for k in range(len(y)):
-            np.testing.assert_allclose(found[k, i], state, rtol=1e-9, atol=1e-12)
-            if np.isfinite(y[k, i, 0]):
-                gains = P[:, :1] / (P[0, 0] + R[0, 0])
-                state, P = state + gains[:, 0] * (y[k, i, 0] - state[0]), P - gains @ P[:1]
-            state, P = A @ state + B @ u[k, i], A @ P @ A.T + Q
 
 
 def test_holding_takes_the_last_measurement_that_arrived():

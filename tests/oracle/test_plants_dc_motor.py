@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
 from kros.plants import DcMotorPopulation
 from kros.plants.dc_motor import DcMotorTruth
@@ -24,23 +21,6 @@ def test_a_constant_voltage_ends_in_the_steady_state_on_paper():
     velocity = (k * 6.0 - R * c) / (k**2 + R * b)  # v = R i + k w and k i = b w + c
     np.testing.assert_allclose(x[1], velocity, rtol=1e-6)
     np.testing.assert_allclose(x[2], (b * velocity + c) / k, rtol=1e-6)
-
-
-def test_without_coulomb_friction_small_voltages_give_the_linear_response():
-    truth = replace(motors(), coulomb=np.zeros(3))
-    voltage = np.random.default_rng(0).uniform(-1, 1, (1, 60))
-    found = truth.respond(voltage)
-    for u in range(3):
-        R, L, k, J, b = (
-            float(p[u])
-            for p in (truth.resistance, truth.inductance, truth.torque_constant, truth.inertia, truth.viscous)
-        )
-        A = np.array([[0, 1, 0, 0], [0, -b / J, k / J, 0], [0, -k / L, -R / L, 1 / L], [0, 0, 0, 0]])
-        step, x = expm(A * DcMotorTruth.sample_period_s), np.zeros(4)
-        for n, v in enumerate(voltage[0]):
-            assert np.all(np.abs(found[:, u, 0, n] - x[:3]) < 1e-4 * np.abs(found[:, u]).max(axis=(1, 2)))
-            x[3] = v
-            x = step @ x
 
 
 def test_with_friction_it_agrees_with_a_general_integrator():

@@ -10,7 +10,6 @@ from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.uncertainty import fit_magnitude, residual
 from kros.uncertainty.weights.cover import Cover
-from kros.uncertainty.weights.fit import fit_weight
 from kros.uncertainty.weights.proof import ProofMethod, certify
 
 DT = 1e-3
@@ -91,16 +90,6 @@ def test_a_peak_between_grid_points_is_found_and_is_the_norm() -> None:
     assert proof.freq_hz == pytest.approx(37.77, rel=1e-4)
     assert ratio(GRID).max() < proof.peak / 2
     assert certify(ratio, GRID, ratio(GRID), [], DT).method is ProofMethod.GRID
-
-
-@pytest.mark.parametrize("form", ["additive", "inverse_input_multiplicative", "inverse_additive"])
-def test_weights_hold_between_grid_points(form: str) -> None:
-    nominal, units = population(5, 3, 2, 2)
-    residuals = of_systems(form, nominal, units)
-    weight, _ = fit_weight(residuals, GRID, DT, 3, 3.0)
-    assert weight.method is ProofMethod.LEVEL_SETS
-    freqs = np.linspace(0.0, 500.0, 20001)
-    assert weight.magnitudes(freqs).ratio(residuals.at(freqs)).max() <= 1
 
 
 def test_a_first_order_is_as_good_as_an_exhaustive_search_over_pole_and_zero() -> None:

@@ -1,4 +1,4 @@
-"""Weights of whole populations: sound on dense grids, checked by a slow independent evaluation."""
+"""Weights of whole populations: sound on dense grids, checked by the definition of the forms."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from drives import DT, drives
+from forms import residual_of
 
 from kros.core import StateSpace
 from kros.core.errors import ConfigError, DataError, DimensionError
@@ -25,42 +26,22 @@ def random_population(n_units: int, seed: int) -> StateSpace:
     return StateSpace(A, B, np.broadcast_to(np.eye(4), A.shape), np.zeros(B.shape), DT)
 
 
-def response(system: StateSpace, z: complex) -> np.ndarray:
-    n = system.n_states
-    return system.C @ np.linalg.solve(z * np.eye(n) - system.A, system.B + 0j) + system.D
-
-
-def slow_ratio(model: UncertainModel, units: StateSpace, freqs: np.ndarray) -> float:
-    """Largest `sigma_max(W_L^-1 E W_R^-1)`, one unit and frequency at a time, from the definition."""
-    pinv, worst = np.linalg.pinv, 0.0
-    for f in freqs:
-        z = np.exp(2j * np.pi * f * DT)
-        scale = lambda g: g / model.output_scale[:, None] * model.input_scale  # noqa: E731
-        left, right, g = (
-            response(model.weight.left, z),
-            response(model.weight.right, z),
-            scale(response(model.nominal_system, z)),
-        )
-        for k in range(units.batch_shape[0]):
-            gp = scale(response(units[k], z))
-            E = {
-                Form.ADDITIVE: lambda g=g, gp=gp: gp - g,
-                Form.INPUT_MULTIPLICATIVE: lambda g=g, gp=gp: pinv(g) @ (gp - g),
-                Form.OUTPUT_MULTIPLICATIVE: lambda g=g, gp=gp: (gp - g) @ pinv(g),
-                Form.INVERSE_ADDITIVE: lambda g=g, gp=gp: pinv(gp) @ (gp - g) @ pinv(g),
-                Form.INVERSE_INPUT_MULTIPLICATIVE: lambda g=g, gp=gp: pinv(gp) @ (gp - g),
-                Form.INVERSE_OUTPUT_MULTIPLICATIVE: lambda g=g, gp=gp: (gp - g) @ pinv(gp),
-            }[model.form]()
-            worst = max(worst, np.linalg.norm(np.linalg.solve(left, E) @ np.linalg.inv(right), 2))
-    return worst
+def largest_ratio(model: UncertainModel, units: StateSpace, freqs: np.ndarray) -> float:
+    """Largest `sigma_max(W_L^-1 E W_R^-1)` from the definition of the form."""
+    into = model.input_scale / model.output_scale[:, None]
+    left, right, G = (
+        s.frequency_response(freqs) for s in (model.weight.left, model.weight.right, model.nominal_system)
+    )
+    E = residual_of(model.form, G * into, units.frequency_response(freqs) * into)
+    return float(np.linalg.norm(np.linalg.solve(left, E) @ np.linalg.inv(right), 2, axis=(-2, -1)).max())
 
 
 @pytest.mark.parametrize("form", ["inverse_input_multiplicative", "additive"])
 def test_weights_of_drives_are_sound_and_tight(form: str) -> None:
-    units = drives(10, 1)
-    model = quantify(units, form, np.geomspace(1e-1, 500.0, 150), output_scale=[1, 3, 1], input_scale=[1, 3])
+    units = drives(6, 1)
+    model = quantify(units, form, np.geomspace(1e-1, 500.0, 80), output_scale=[1, 3, 1], input_scale=[1, 3])
     off_grid = np.random.default_rng(0).uniform(np.log(1e-1), np.log(500.0), 50)
-    assert slow_ratio(model, units, np.concatenate([np.exp(off_grid), [1e-6, 500.0]])) <= 1 + 1e-6
+    assert largest_ratio(model, units, np.concatenate([np.exp(off_grid), [1e-6, 500.0]])) <= 1 + 1e-6
     assert model.cover_max <= 1
     assert model.overbound_db_max <= 3
     assert max(*model.weight.left_orders, *model.weight.right_orders) <= 4
@@ -75,29 +56,10 @@ def test_weights_of_drives_are_sound_and_tight(form: str) -> None:
 def test_weights_of_random_tall_systems_are_sound(form: Form) -> None:
     units = random_population(4, 2)
     model = quantify(units, form, np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
-    assert slow_ratio(model, units, np.linspace(1.0, 500.0, 41)) <= 1 + 1e-6
+    assert largest_ratio(model, units, np.linspace(1.0, 500.0, 41)) <= 1 + 1e-6
     assert model.cover_max <= 1
-
-
-def test_remainder_covers_what_the_form_leaves_out() -> None:
-    units = random_population(4, 3)
-    model = quantify(units, "inverse_input_multiplicative", np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
-    assert model.misfit_max > 0.01
-    assert model.remainder is not None
-    for f in np.linspace(2.0, 490.0, 23):
-        z = np.exp(2j * np.pi * f * DT)
-        g, left, right = (
-            response(model.nominal_system, z),
-            response(model.remainder.left, z),
-            response(model.remainder.right, z),
-        )
-        for k in range(4):
-            gp = response(units[k], z)
-            rest = gp - g @ np.linalg.inv(np.eye(2) - np.linalg.pinv(gp) @ (gp - g))
-            assert np.linalg.norm(np.linalg.solve(left, rest) @ np.linalg.inv(right), 2) <= 1 + 1e-6
-    additive = quantify(units, "additive", np.geomspace(1.0, 500.0, 20), max_order=1, tolerance_db=20.0)
-    assert additive.remainder is None
-    assert additive.misfit_max < 1e-12
+    exact = form in (Form.ADDITIVE, Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+    assert (model.remainder is None) == (model.misfit_max < 1e-12) == exact
 
 
 def test_scalar_first_order_population_has_the_residual_of_the_textbook() -> None:
@@ -113,10 +75,9 @@ def test_scalar_first_order_population_has_the_residual_of_the_textbook() -> Non
     assert model.remainder is None
 
 
-@pytest.mark.parametrize("seed", [16])
-def test_weights_are_the_same_in_other_units_of_measure_and_in_another_order(seed: int) -> None:
+def test_weights_are_the_same_in_other_units_of_measure_and_in_another_order() -> None:
     """Their optimum is unique: nothing but rounding moves it."""
-    units, freqs = drives(5, seed), np.geomspace(1.0, 500.0, 24)
+    units, freqs = drives(5, 16), np.geomspace(1.0, 500.0, 24)
     out, into = np.array([1e3, 1e-4, 10.0]), np.array([1e-2, 1e4])
     plain, shuffled = (
         quantify(some, "input_multiplicative", freqs, max_order=2) for some in (units, units[[3, 1, 4, 0, 2]])
@@ -146,7 +107,7 @@ def test_nominal_may_be_named_and_a_set_is_saved(tmp_path: Path) -> None:
     ids = ("a", "b", "c", "d")
     found = quantify(units, freqs_hz=freqs, unit_ids=ids, nominal="c", max_order=1)
     assert (found.nominal, found.nominal_id) == (2, "c")
-    assert slow_ratio(found, units, np.array([1.3, 40.0, 333.0])) <= 1 + 1e-6
+    assert largest_ratio(found, units, np.array([1.3, 40.0, 333.0])) <= 1 + 1e-6
     found.save(tmp_path)
     loaded = UncertainModel.load(tmp_path)
     assert loaded.peak_db == found.peak_db

@@ -88,7 +88,7 @@ def test_a_batch_one_machine_and_c_agree(delay, guard, tmp_path):
     batch, status = run_with_status(o, y, u)
     assert np.isfinite(batch).all()
     compiled = CompiledObserver.build(export_c(o, tmp_path / "c", "o"))
-    for i in range(0, y.shape[1], 2):
+    for i in range(0, y.shape[1], 4):
         running = o.start(y[0, i])
         found = [
             (np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y[:, i], u[:, i], strict=True)
@@ -132,7 +132,7 @@ def test_a_recording_in_blocks_is_run_as_a_whole(kind, delay, loops, monkeypatch
     if not loops:
         monkeypatch.setattr("kros.observer.simulate.library", lambda: None)
     borders = [0, 1, 2, 5, 65, 66, 110, 150, 185, 200, 310, 350, 390, 400]
-    for i in range(0, y.shape[1], 2):
+    for i in range(0, y.shape[1], 4):
         whole, status = run_with_status(o, y[:, i : i + 1], u[:, i : i + 1])
         course = Course(o)
         runs = [course.take(y[a:b, i : i + 1], u[a:b, i : i + 1]) for a, b in pairwise(borders)]

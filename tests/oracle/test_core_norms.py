@@ -57,7 +57,7 @@ def test_lightly_damped_discrete_where_a_grid_fails(gap, angle):
 @pytest.mark.parametrize("dt", [0.0, 1.0, 1e-3])
 def test_random_systems_against_a_dense_grid_and_scipy(dt):
     rng = np.random.default_rng(7)
-    for _ in range(25):
+    for _ in range(12):
         system = random_stable(rng, int(rng.integers(1, 11)), dt)
         sizes = np.abs(system.poles() - (dt > 0))
         freqs = np.geomspace(sizes.min() / 30, np.pi if dt > 0 else 30 * sizes.max(), 3000) / (2 * np.pi * (dt or 1))
@@ -103,7 +103,7 @@ def stiff_loop(rng, n=4):
     )
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_gain_of_a_stiff_system_is_at_least_what_it_is_anywhere(seed):
     """Against gains of the same matrices in 40 digits, at frequencies around every pole."""
     rng = np.random.default_rng(seed)
@@ -117,7 +117,7 @@ def test_the_gain_of_a_stiff_system_is_at_least_what_it_is_anywhere(seed):
     assert found <= gains.max() * 1.1  # of a grid
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_h2_norm_of_a_stiff_system_is_exact(seed):
     """Against the Lyapunov equation solved as linear equations in 60 digits."""
     system = stiff_loop(np.random.default_rng(100 + seed), 2)

@@ -22,7 +22,7 @@ def test_energy_is_what_enters_less_what_leaves(loaded):
             parameters(error_1=2e-3), np.full(N, loaded), np.array([0.3, 1.0, -2.0]), drive.PERIOD_S / 5 / finer
         )
         start, balance, turned = physics.energy(), 0.0, 0.0
-        for k in range(4000 * finer):
+        for k in range(2000 * finer):
             powers = physics.advance(np.full(N, 0.6 * np.sign(np.sin(8 * k * physics.step_s + 0.5))))
             balance = balance + physics.step_s * (powers["in"] - powers["out"])
             turned = turned + physics.step_s * np.abs(powers["in"])
@@ -69,7 +69,7 @@ def test_without_friction_error_and_gravity_it_is_a_linear_two_mass_system():
 
 
 def test_a_population_is_one_for_a_study():
-    population, _ = drive.simulate(n_units=2, n_episodes=2, seconds=3.0, seed=3)
+    population, _ = drive.simulate(n_units=1, n_episodes=1, seconds=2.0, seed=3)
     assert (population.states, population.inputs) == (
         ("position", "velocity", "current"),
         ("target_position", "target_velocity"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from batches import batch_of, run_with_status
 from machines import filters
-from recorded_plant import DT, FEW, LIFTING, plant
+from recorded_plant import DT, FEW, LIFTING, estimator, plant, recorded_motors
 
 import kros
 from kros.core.errors import ConfigError
@@ -31,7 +31,7 @@ from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.gaps import decay
 from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Moments, Readout, Whitening, condition_weights
-from kros.observer.estimator.rows import Design, bridged
+from kros.observer.estimator.rows import Design
 from kros.observer.simulate import Course
 
 
@@ -49,12 +49,9 @@ def exact():
 
 @pytest.fixture(scope="module")
 def motors() -> tuple[Observer, EpisodeBatch]:
-    population = kros.plants.DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.0, seed=3).simulate().population
-    recordings = Recordings.of(list(population.keys()), lambda key: EpisodeBatch.read(population, [key]))
-    found = identify_estimator(
-        "motor", Lifting(population.states), (0,), population.inputs, recordings, 1e-3, settings=FEW
-    )
-    return found.observer, EpisodeBatch.read(population, list(population.keys()))
+    population, recordings = recorded_motors()
+    observer = estimator(recordings, Lifting(population.states), inputs=population.inputs, dt=1e-3)
+    return observer, EpisodeBatch.read(population, list(population.keys()))
 
 
 def test_a_bank_is_its_system():
@@ -261,7 +258,7 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     np.testing.assert_allclose((errors.T @ errors)[moved][:, moved], 0.25, atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
-        observer = identify_estimator("plant", LIFTING, (0,), ("u",), one, DT, settings=FEW).observer
+        observer = estimator(one)
         runs = (run_observer(observer, batch.states[..., :1] + b, batch.inputs)[..., 1:3] for b in (0.5, 0.0))
         errors.append(np.sqrt(np.mean(np.subtract(*runs) ** 2, axis=(0, 1))))
     assert (errors[1] < 0.5 * errors[0]).all()
@@ -361,21 +358,10 @@ def test_an_input_that_is_lost_is_held_and_starts_nothing_anew(motors):
     assert wanted.shape[-1] == len(observer.recorded) < observer.lifting.n_states
 
 
-def test_batches_and_single_machines_are_alike_with_and_without_gaps(motors):
-    observer, batch = motors
-    y = batch.states[:300, :, :1].copy()
-    y[40:60, 0], y[100::3, 1] = np.nan, np.nan
-    wanted = run_observer(observer, y, batch.inputs[:300])
-    for machine in (0, 1, 2):
-        running = observer.start(y[0, machine])
-        rows = [np.asarray(running.step(y[k, machine], batch.inputs[k, machine])) for k in range(299)]
-        np.testing.assert_allclose(rows, wanted[1:, machine], atol=1e-8 * np.abs(wanted).max())
-
-
 @pytest.mark.parametrize("reference", [False, True])
 def test_a_position_that_goes_on_for_ever_changes_nothing(reference):
     """The same motion a thousand turns on gives the same estimates, with and without losses, and no gain at rest."""
-    population = kros.plants.DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    population, _ = recorded_motors()
     names, inputs = population.states, (*population.inputs, "reference")[: 1 + reference]
 
     def read(key: EpisodeKey) -> EpisodeBatch:
@@ -386,7 +372,7 @@ def test_a_position_that_goes_on_for_ever_changes_nothing(reference):
 
     recordings = Recordings.of(list(population.keys()), read)
     free = FEW.model_copy(update={"unbounded": {names[0]: inputs[1:]}})
-    observer = identify_estimator("motor", Lifting(names), (0,), inputs, recordings, 1e-3, settings=free).observer
+    observer = estimator(recordings, Lifting(names), inputs=inputs, dt=1e-3, settings=free)
     batch, turns = read(recordings.keys[0]), 2 * np.pi * 1000
     y, moved = batch.measurements([0]), batch.inputs + np.array([0.0, turns])[: len(inputs)]
     lost = np.where(np.random.default_rng(0).random(y.shape) < 0.5, np.nan, y)
@@ -400,56 +386,37 @@ def test_a_position_that_goes_on_for_ever_changes_nothing(reference):
         np.testing.assert_allclose(still[1:], 0.0, atol=1e-9)
     wrong = FEW.model_copy(update={"unbounded": {names[1]: ()}})
     with pytest.raises(ConfigError, match="unbounded should map measured states"):
-        identify_estimator("motor", Lifting(names), (0,), inputs, recordings, 1e-3, settings=wrong)
+        estimator(recordings, Lifting(names), inputs=inputs, dt=1e-3, settings=wrong)
 
 
 def test_estimates_stay_inside_declared_limits():
-    population = kros.plants.DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.0, seed=3).simulate().population
-    recordings = Recordings.of(list(population.keys()), lambda key: EpisodeBatch.read(population, [key]))
-    parts = Lifting(population.states, sizes=(("current", 2.0),)), (0,), population.inputs, recordings, 1e-3
+    population, recordings = recorded_motors()
+    parts = recordings, Lifting(population.states, sizes=(("current", 2.0),)), (0,), population.inputs, 1e-3
     batch = recordings.read(recordings.keys[0])
     top = 0.5 * float(np.abs(batch.states[..., 2]).max())
     declared = FEW.model_copy(update={"limits": {"current": (-2 * top, 2 * top)}})  # in the recordings' unit
     free, limited = (
-        run_observer(identify_estimator("motor", *parts, settings=one).observer, batch.measurements([0]), batch.inputs)
-        for one in (FEW, declared)
+        run_observer(estimator(*parts, settings=one), batch.measurements([0]), batch.inputs) for one in (FEW, declared)
     )
     np.testing.assert_array_equal(limited[..., 2], np.clip(free[..., 2], -top, top))
     np.testing.assert_array_equal(limited[..., :2], free[..., :2])
     for limits in ({"torque": (0.0, 1.0)}, {"current": (1.0, 0.0)}):
         wrong = FEW.model_copy(update={"limits": limits})
-        with pytest.raises(
-            ConfigError, match="should be the least and the largest value of one of position, velocity,"
-        ):
-            identify_estimator("motor", *parts, settings=wrong)
-
-
-def test_families_grow_and_straight_lines_bridge_losses():
-    recordings, _ = plant(units=2, episodes=1)
-    sizes = [len(design(recordings, family).bank) for family in FAMILIES]
-    assert sizes == sorted(set(sizes))
-    line = np.arange(10.0)[:, None]
-    lost = np.arange(10) % 3 == 1
-    np.testing.assert_allclose(bridged(np.where(lost[:, None], np.nan, line), lost), line)
+        with pytest.raises(ConfigError, match="should be the least and the largest value of one of position, velocity"):
+            estimator(*parts, settings=wrong)
 
 
 def test_declared_losses_do_not_change_what_is_learned():
-    population = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    sensor = {population.measured[0]: Sensor(dropout=0.3)}
-    parts = "motor", Lifting(population.states), (0,), population.inputs
-    observers = []
-    for declared in ({}, sensor):
-        recordings = Recordings.of(
-            list(population.keys()),
-            lambda key, own=declared: as_shown(EpisodeBatch.read(population, [key]), own, population.states),
-        )
-        observers.append(identify_estimator(*parts, recordings, 1e-3, settings=FEW).observer)
-    np.testing.assert_array_equal(observers[1].A, observers[0].A)
+    population, recordings = recorded_motors(2, 2)
+    sensor, parts = {population.measured[0]: Sensor(dropout=0.3)}, (Lifting(population.states), (0,), population.inputs)
+    shown = replace(recordings, read=lambda key: as_shown(recordings.read(key), sensor, population.states))
+    one, other = (estimator(each, *parts, dt=1e-3) for each in (recordings, shown))
+    np.testing.assert_array_equal(one.A, other.A)
 
 
 def from_rest(places: list[float], seed: int) -> tuple[Recordings, dict]:
     """A decaying oscillator that starts at rest at given places, where its measurement alone says what follows."""
-    A = np.linalg.matrix_power(np.array([[1.0, 0.01], [-0.04, 0.996]]), 1)
+    A = np.array([[1.0, 0.01], [-0.04, 0.996]])
     rng, batches = np.random.default_rng(seed), {}
     for episode, place in enumerate(places):
         for unit in ("a", "b", "c", "d"):
@@ -465,13 +432,13 @@ def from_rest(places: list[float], seed: int) -> tuple[Recordings, dict]:
 
 def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_too():
     lifting = Lifting(("position", "velocity"))
-    rng, settings = np.random.default_rng(3), {"delays": 16, "rows": 20_000, "start_share": 1e-12}
+    rng, settings = np.random.default_rng(3), {"delays": 16, "rows": 6000, "start_share": 1e-12}
     recordings, _ = from_rest(list(rng.uniform(-2, 2, 6)), 1)
     unseen = from_rest(list(rng.uniform(-2, 2, 4)), 2)[1]
     errors = []
     for share in (1e-12, 0.1):
         chosen = EstimatorSettings(**settings, restart_share=share, settled_share=1e-4 * share)
-        observer = identify_estimator("e", lifting, (0,), ("u",), recordings, 0.01, settings=chosen).observer
+        observer = estimator(recordings, lifting, settings=chosen)
         off = []
         for begin in (0, 150):
             runs = [run_observer(observer, b.states[begin:, :, :1], b.inputs[begin:])[:, 0, 1] for b in unseen.values()]
@@ -485,9 +452,7 @@ def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_to
 def test_a_machine_without_inputs_has_an_estimator():
     batches = {k: replace(b, inputs=b.inputs[..., :0]) for k, b in from_rest([-2.0, -1.0, 0.5, 1.5], 1)[1].items()}
     recordings = Recordings.of(list(batches), batches.__getitem__)
-    observer = identify_estimator(
-        "e", Lifting(("position", "velocity")), (0,), (), recordings, 0.01, settings=FEW
-    ).observer
+    observer = estimator(recordings, Lifting(("position", "velocity")), inputs=())
     batch = next(iter(batches.values()))
     speed = run_observer(observer, batch.states[..., :1], batch.inputs)[:, 0, 1]
     assert np.std(speed - batch.states[:, 0, 1]) < 0.1 * np.std(batch.states[:, 0, 1])
@@ -507,9 +472,8 @@ def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well()
     recordings = Recordings.of([key for key in batches if key.episode != "5"], batches.__getitem__)
     errors = []
     for shares in ({"start_share": 1e-12, "restart_share": 1e-12}, {}):
-        chosen = EstimatorSettings(delays=16, rows=20_000, **shares)
-        lifting = Lifting(("position", "velocity"))
-        observer = identify_estimator("e", lifting, (0,), ("u",), recordings, 0.01, settings=chosen).observer
+        chosen = EstimatorSettings(delays=16, rows=6000, **shares)
+        observer = estimator(recordings, Lifting(("position", "velocity")), settings=chosen)
         unseen = [b for key, b in batches.items() if key.episode == "5"]
         off = [run_observer(observer, b.states[..., :1], b.inputs)[:50, 0, 1] - b.states[:50, 0, 1] for b in unseen]
         errors.append(np.sqrt(np.mean(np.square(off))))
@@ -569,7 +533,8 @@ def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():
         kros.identify(pendulums, lifting=["sin(position)"], refine=False), n_freqs=50, max_order=1
     )
     designs = [
-        kros.synthesize(uncertain, f"koopman_edmd/{method}", methods=()) for method in ("estimator", "open_loop")
+        kros.synthesize(uncertain, f"koopman_edmd/{method}", methods=(), estimator={"folds": 2, "parts": 2})
+        for method in ("estimator", "open_loop")
     ]
     keys = uncertain.models.facts.test
     batch = EpisodeBatch.read(pendulums, keys, 1000, uncertain.models.parameters)
@@ -590,13 +555,9 @@ def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():
 @pytest.fixture(scope="module")
 def two_sensors():
     """A motor of which position and current are measured."""
-    motors = kros.plants.DcMotorPopulation(n_units=4, n_episodes=4, seconds=1.0, seed=3).simulate().population
-    keys = list(motors.keys())
-    recordings = Recordings.of(keys, lambda key: EpisodeBatch.read(motors, [key]))
-    observer = identify_estimator(
-        "motor", Lifting(motors.states), (0, 2), motors.inputs, recordings, motors.sample_period_s, settings=FEW
-    ).observer
-    return observer, EpisodeBatch.read(motors, keys)
+    population, recordings = recorded_motors(4, 4)
+    observer = estimator(recordings, Lifting(population.states), (0, 2), population.inputs, 1e-3)
+    return observer, EpisodeBatch.read(population, list(population.keys()))
 
 
 @pytest.mark.parametrize("lost", [0, 1])

@@ -137,8 +137,8 @@ def test_what_cannot_be_a_monitor_is_refused():
 
 
 def test_the_bound_is_that_of_one_more_unit():
-    """Peaks sample by sample, episodes one after the other, the bound by hand; a unit that shakes is outside."""
-    simulated = HarmonicDrivePopulation(n_units=6, n_episodes=3, seconds=2.0, conditions=("noload",), seed=3).simulate()
+    """Peaks of episodes one after the other, the bound by hand; a unit that shakes is outside."""
+    simulated = HarmonicDrivePopulation(n_units=6, n_episodes=3, seconds=3.0, conditions=("noload",), seed=3).simulate()
     A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.zeros((2, 2))
     K = gain(np.array([[0.2], [10.0]]), DT)
     observer = Observer(
@@ -160,13 +160,9 @@ def test_the_bound_is_that_of_one_more_unit():
     records = {key: population.read(key) for key in population.episodes}
     found, watches = {}, {unit: Watch(monitor) for unit in population.unit_ids}
     for key, r in records.items():
-        watch = watches[key.unit]
         innovation, _ = run_innovations(observer, r[:, None, :1], r[:, None, 3:], settle=0)
-        course = []
-        for k, nu in enumerate(innovation[:, 0]):
-            watch.take(nu[None], *(np.array([flag]) for flag in (False, k == 0, True)))
-            course.append(watch.level_db)
-        found[key] = max(course)
+        squares = watches[key.unit].mean_squares(innovation[:, 0], np.arange(len(r)) >= monitor.settle)
+        found[key] = monitor.level(squares).max()
     peaks = np.array([[v for key, v in found.items() if key.unit == unit] for unit in population.unit_ids])
     of_motions, student = peaks.mean(axis=0), {5: 2.015048, 2: 2.919986}
     apart = [(of_motions[i] - of_motions[j]) ** 2 for i, j in ((0, 1), (0, 2), (1, 2))]
@@ -179,8 +175,8 @@ def test_the_bound_is_that_of_one_more_unit():
     loudest = records[max(found, key=found.get)]
     y, u = loudest[:, :1], loudest[:, 3:]
     shaken = y + 1e-2 * np.sin(100 * y)  # three short motions differ so much that the bound is wide
-    assert not (levels(own, y, u)[1] & SampleStatus.UNCERTIFIED).any()
-    assert (levels(own, shaken, u)[1] & SampleStatus.UNCERTIFIED).any()
+    status = [Course(own, watched=True).take(one[:, None], u[:, None]).status for one in (y, shaken)]
+    assert [bool((one & SampleStatus.UNCERTIFIED).any()) for one in status] == [False, True]
     assert fit_monitor(observer, replace(training, keys=training.keys[:4]), settings) is None
 
 

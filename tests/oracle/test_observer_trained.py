@@ -36,8 +36,8 @@ def test_a_unit_is_estimated_by_a_regression_that_does_not_know_it(kind):
     rng = np.random.default_rng(0)
     arrays = {}
     for unit, level in {"a": 1.0, "b": 1.0, "c": 5.0}.items():  # what a hidden state is, nothing tells but the unit
-        x = rng.standard_normal((2, 400)).cumsum(axis=1)
-        arrays[unit] = [np.column_stack([one, level + 0.01 * rng.standard_normal(400), one]) for one in x]
+        x = rng.standard_normal((2, 150)).cumsum(axis=1)
+        arrays[unit] = [np.column_stack([one, level + 0.01 * rng.standard_normal(150), one]) for one in x]
     population = kros.from_arrays(arrays, states=["x", "level"], measured=["x"], inputs=["u"], sample_period_s=0.01)
     training = TrainingSet(population, population.keys(), {unit: {} for unit in arrays})
     baseline = make_trained(training, (0,), kind)

@@ -6,7 +6,8 @@ import numpy as np
 
 from kros.data import EpisodeBatch, EpisodeKey
 from kros.lifting import Lifting
-from kros.observer import EstimatorSettings, Recordings
+from kros.observer import EstimatorSettings, Recordings, identify_estimator
+from kros.plants import DcMotorPopulation
 
 FEW = EstimatorSettings(rows=4000, sample=1500, delays=20, gap_samples=1200, gap_episodes=4)
 DT = 0.01
@@ -29,3 +30,15 @@ def plant(units=4, episodes=3, samples=400, spread=0.0):
 
 
 LIFTING = Lifting(("position", "velocity", "force"))
+
+
+def recorded_motors(units=3, episodes=3):
+    """Return DC motors for a second at 1 kHz, and their recordings."""
+    simulated = DcMotorPopulation(n_units=units, n_episodes=episodes, seconds=1.0, seed=3).simulate()
+    population = simulated.population
+    return population, Recordings.of(list(population.keys()), lambda key: EpisodeBatch.read(population, [key]))
+
+
+def estimator(recordings, lifting=LIFTING, measured=(0,), inputs=("u",), dt=DT, settings=FEW):
+    """Return the observer that is identified from recordings."""
+    return identify_estimator("test", lifting, measured, inputs, recordings, dt, settings=settings).observer

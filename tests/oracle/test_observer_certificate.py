@@ -9,14 +9,13 @@ from math import isqrt
 import numpy as np
 import pytest
 from adversary import attack, attack_running
-from batches import batch_of
-from frozen import compared
+from contracting import contracting
 from scipy.optimize import minimize
 
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.lifting import Lifting
-from kros.observer import Observer, run_observer
+from kros.observer import Observer
 from kros.observer.certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from kros.observer.certificate.error import ErrorSystem, ReliftScales, error_system
 from kros.observer.certificate.proof import best_multipliers, lyapunov_factor, positive, proposals, proven, proven_gain
@@ -30,28 +29,9 @@ def scalar(a: float, b: float, correction: float = 0.0) -> Observer:
     return Observer("scalar", lifting, model, B, (0,), ("u",), K, Injection.STATE, 1.0)
 
 
-def random_observer(
-    rng: np.random.Generator, functions: tuple[str, ...], order: int = 3, injection: Injection = Injection.STATE
-) -> Observer:
-    """Three states, a dynamic correction, contracting enough to be certified."""
-    lifting = Lifting(("a", "b", "c"), functions, inputs=("u",))
-    n, p = 3, len(functions)
-    A = np.vstack(
-        [
-            np.hstack([0.7 * np.linalg.qr(rng.standard_normal((n, n)))[0], 0.05 * rng.standard_normal((n, p))]),
-            rng.standard_normal((p, n + p)),
-        ]
-    )
-    B = rng.standard_normal((n + p, 1))
-    width = 1 if injection is Injection.INPUT else n + p
-    K = StateSpace(
-        np.diag(np.linspace(0.2, 0.6, order)),
-        rng.standard_normal((order, 1)),
-        0.05 * rng.standard_normal((width, order)),
-        0.05 * rng.standard_normal((width, 1)),
-        0.01,
-    )
-    return Observer("random", lifting, A, B, (0,), ("u",), K, injection, 0.01)
+def random_observer(rng, functions, order=3, injection=Injection.STATE) -> Observer:
+    """Contracting enough to be certified."""
+    return contracting(functions, order, injection, seed=rng, radius=0.7, lifted=0.05)
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.5, 0.2), (-0.4, 0.55), (0.0, 0.9), (0.98, -0.015)])
@@ -141,29 +121,6 @@ def test_brute_force_over_all_slope_sequences_stays_below_the_gain() -> None:
     assert 0.3 * found.gain < worst <= found.gain
 
 
-@pytest.mark.parametrize("injection", list(Injection)[:2])
-@pytest.mark.parametrize(
-    "functions", [("a[-1]",), ("b[-2]", "a[-1]"), ("sin(2*a)",), ("sin(a + b)", "u[-1]*1"), ("cos(b[-1])",)]
-)
-def test_the_error_system_is_the_observer_as_it_runs(functions: tuple[str, ...], injection: Injection) -> None:
-    """Linear functions of earlier states leave nothing to bound: the frozen response is the error, to rounding. Others stay within the bound."""
-    rng = np.random.default_rng(7)
-    observer = random_observer(rng, functions, injection=injection)
-    states, inputs = np.cumsum(0.1 * rng.standard_normal((400, 5, 3)), axis=0), rng.standard_normal((400, 5, 1))
-    found = relift_certificate(observer)
-    assert found.certified, found.reason
-    rows = compared(found, observer, batch_of(states, inputs, 0.01))
-    assert all(row.holds for row in rows)
-    estimates = run_observer(observer, states[..., :1], inputs)
-    assert [row.error for row in rows] == pytest.approx(
-        np.sqrt(np.mean(np.sum((states - estimates) ** 2, axis=2), axis=0)), rel=1e-12
-    )
-    if not found.channels:
-        assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
-    else:
-        assert all(row.frozen != pytest.approx(row.error, rel=1e-6) for row in rows)
-
-
 def test_a_product_of_state_and_input_is_covered_inside_its_box() -> None:
     lifting = Lifting(("x",), (), (), ("u",), ("u*x",))
     observer = Observer(
@@ -194,15 +151,14 @@ def test_many_slopes_are_certified_by_multipliers() -> None:
     assert attack(found, observer, steps=20000).share <= 1
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_an_adversary_comes_close_and_never_exceeds(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    observer = random_observer(rng, ("sin(a)", "sin(b + c)")[: 1 + seed % 2], order=seed)
+    observer = random_observer(rng, ("sin(a)", "sin(b + c)")[: 1 + seed], order=seed)
     found = relift_certificate(observer, scales=ReliftScales(np.ones(3), np.array([0.1, 1.0, 2.0]), np.array([0.5])))
     worst = attack(found, observer, steps=20000, seed=seed)
-    assert (
-        (0.2 if seed % 2 else 0.75) * found.gain < worst.gain <= found.gain
-    )  # two slopes: the multipliers lose against the corners
+    least = 0.2 if seed else 0.75  # two slopes: the multipliers lose against the corners
+    assert least * found.gain < worst.gain <= found.gain
     assert worst.share <= 1
     inputs = rng.standard_normal((len(worst.disturbance) + 1, 6, 1))
     share, _ = attack_running(found, observer, worst.disturbance, rng.standard_normal((6, 3)), inputs, seed=seed)
@@ -210,22 +166,12 @@ def test_an_adversary_comes_close_and_never_exceeds(seed: int) -> None:
 
 
 def test_the_adversary_refutes_a_gain_that_is_too_small() -> None:
-
     observer = scalar(0.5, 0.2)
     found = relift_certificate(observer)
     wrong = replace(found, gain=0.9 * found.gain)
     assert attack(wrong, observer, steps=5000).share > 1
-    assert (
-        attack_running(
-            wrong,
-            observer,
-            np.full((200, 2), [1.0, 0.0]),
-            np.full((40, 1), 0.0),
-            np.zeros((201, 40, 1)),
-            amplitudes=(1e-4, 1e-2),
-        )[0]
-        > 1
-    )
+    constant, rest = np.full((200, 2), [1.0, 0.0]), np.zeros((201, 40, 1))
+    assert attack_running(wrong, observer, constant, rest[0], rest, amplitudes=(1e-4, 1e-2))[0] > 1
 
 
 def test_the_proof_is_exact_at_the_edge() -> None:

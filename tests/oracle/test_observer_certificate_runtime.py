@@ -8,68 +8,45 @@ import numpy as np
 import pytest
 from adversary import attack, attack_running
 from batches import batch_of
+from contracting import DT, contracting, recordings
 from frozen import compared
 
-from kros.core.lti import StateSpace
 from kros.evaluate.sensor import as_shown
-from kros.lifting import Lifting
-from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, run_observer
+from kros.observer import ReliftScales, Runtime, Sensor, relift_certificate, run_observer
 from kros.observer.certificate.error import error_system, state_sizes
 from kros.synthesis import Injection
-
-DT = 0.01
-
-
-def observer(
-    functions: tuple[str, ...] = (), order: int = 2, injection: Injection = Injection.STATE, **runtime: object
-) -> Observer:
-    """Three states, stable without correction too, so that a certificate exists whatever limits do."""
-    rng = np.random.default_rng(11)
-    lifting, n, p = Lifting(("a", "b", "c"), functions, inputs=("u",)), 3, len(functions)
-    A = np.vstack(
-        [
-            np.hstack([0.85 * np.linalg.qr(rng.standard_normal((n, n)))[0], 0.03 * rng.standard_normal((n, p))]),
-            np.zeros((p, n + p)),
-        ]
-    )
-    width = 1 if injection is Injection.INPUT else n + p
-    C, D = 0.05 * rng.standard_normal((width, order)), 0.1 * rng.standard_normal((width, 1))
-    K = StateSpace(np.diag(np.linspace(0.2, 0.6, order)), rng.standard_normal((order, 1)), C, D, DT)
-    B = np.vstack([rng.standard_normal((n, 1)), np.zeros((p, 1))])
-    return Observer("o", lifting, A, B, (0,), ("u",), K, injection, DT, runtime=Runtime(**runtime))  # type: ignore[arg-type]
-
-
-def recordings(observer: Observer, seed: int = 0, size: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
-    """A machine that is none of the models, inside the limits."""
-    rng = np.random.default_rng(seed)
-    x = np.cumsum(0.1 * rng.standard_normal((300, 6, 3)), axis=0) + rng.standard_normal((6, 3))
-    return np.tanh(x) * size, rng.standard_normal((300, 6, 1))
 
 
 def late(states: np.ndarray, delay: int) -> np.ndarray:
     return states[np.maximum(np.arange(len(states)) - delay, 0)][..., :1]
 
 
-@pytest.mark.parametrize("functions", [(), ("b[-2]", "a[-1]")])
-@pytest.mark.parametrize("delay", [1, 4])
-def test_without_slopes_the_frozen_response_is_the_error_of_a_late_observer(
-    delay: int, functions: tuple[str, ...]
-) -> None:
-    """Start, chain of predictions and correction filter: the equations are the code, to rounding."""
-    late_one = observer(functions, delay=delay, upper=np.array([np.inf, 9.0, np.inf]) if delay == 1 else None)
-    found = relift_certificate(late_one)
-    x, u = recordings(late_one)
-    estimates = run_observer(late_one, late(x, delay), u)
-    rows = compared(found, late_one, batch_of(x, u, DT), estimates)
-    assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
+@pytest.mark.parametrize(
+    "functions", [(), ("a[-1]",), ("b[-2]", "a[-1]"), ("sin(2*a)",), ("sin(a + b)", "u[-1]*1"), ("cos(b[-1])",)]
+)
+@pytest.mark.parametrize(
+    ("delay", "injection"), [(0, Injection.STATE), (0, Injection.INPUT), (1, Injection.STATE), (4, Injection.STATE)]
+)
+def test_the_error_system_is_the_observer_as_it_runs(delay, injection, functions) -> None:
+    """Start, chain of predictions and correction filter: linear functions leave nothing to bound, and the frozen response is the error, to rounding."""
+    upper = np.array([np.inf, 9.0, np.inf]) if delay == 1 else None
+    observer, (x, u) = contracting(functions, injection=injection, delay=delay, upper=upper), recordings(size=3.0)
+    found = relift_certificate(observer)
+    assert found.certified, found.reason
+    estimates = run_observer(observer, late(x, delay), u)
+    rows = compared(found, observer, batch_of(x, u, DT), estimates)
     assert all(row.holds for row in rows)
+    errors = np.sqrt(np.mean(np.sum((x - estimates) ** 2, axis=2), axis=0))
+    assert [row.error for row in rows] == pytest.approx(errors, rel=1e-12)
+    exact = [row.frozen == pytest.approx(row.error, rel=1e-9) for row in rows]
+    assert set(exact) == {not found.channels}
 
 
 @pytest.mark.parametrize("delay", [0, 2])
 def test_what_a_sensor_shows_beside_the_states_drives_the_frozen_response(delay: int) -> None:
-    noisy = observer(delay=delay)
+    noisy = contracting(delay=delay)
     found = relift_certificate(noisy)
-    x, u = recordings(noisy)
+    x, u = recordings()
     sensor = {"a": Sensor(noise=5.0, bias=2.0, resolution=0.1, delay_samples=delay)}
     batch = as_shown(batch_of(x, u, DT), sensor, ("a", "b", "c"))
     rows = compared(found, noisy, batch)
@@ -81,7 +58,7 @@ def test_what_a_sensor_shows_beside_the_states_drives_the_frozen_response(delay:
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
 def test_sizes_of_the_error_system_are_those_of_what_its_states_are(delay: int) -> None:
-    late = observer(("b[-2]",), delay=delay)
+    late = contracting(("b[-2]",), delay=delay)
     system = error_system(late)
     window = sum(name in late.lifting.states for name, _ in late.lifting.window.quantities)
     sizes = state_sizes(late, ReliftScales.ones(late), np.arange(1.0, window + 1))
@@ -96,11 +73,11 @@ RUNTIMES = {"none": {}, "delay": {"delay": 3}, "limits": {"lower": np.full(3, -0
 @pytest.mark.parametrize("what", RUNTIMES)
 def test_bounds_hold_for_the_observer_as_it_runs(what: str) -> None:
     """Recordings of another machine, random and worst disturbances at many amplitudes; limits cut off, and that is seen."""
-    o = observer(("0.3*sin(3*a)", "0.2*cos(2*b)"), **RUNTIMES[what])
+    o = contracting(("0.3*sin(3*a)", "0.2*cos(2*b)"), **RUNTIMES[what])
     scales = ReliftScales(np.ones(3), np.array([0.1, 0.2, 0.1]), np.array([0.05]))
     found = relift_certificate(o, scales=scales)
     assert found.certified, found.reason
-    x, u = recordings(o)
+    x, u = recordings()
     estimates = run_observer(o, late(x, o.runtime.delay), u)
     rows = compared(found, o, batch_of(x, u, DT), estimates)
     assert all(row.holds for row in rows)

@@ -7,36 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from batches import batch_of
+from contracting import DT, contracting, recordings
 from frozen import as_shown
 
-from kros.core.lti import gain
 from kros.data import EpisodeBatch
-from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, Seen, relift_certificate, run_observer
+from kros.observer import Observer, Seen, relift_certificate, run_observer
 from kros.observer.certificate.signals import signal_bound
-from kros.synthesis import Injection
 
-DT, N = 0.01, 600
-
-
-def observer(functions: tuple[str, ...] = (), **runtime: object) -> Observer:
-    rng, p = np.random.default_rng(3), len(functions)
-    lifting = Lifting(("a", "b", "c"), functions, inputs=("u",))
-    A = np.vstack(
-        [
-            np.hstack([0.7 * np.linalg.qr(rng.standard_normal((3, 3)))[0], 0.02 * rng.standard_normal((3, p))]),
-            np.zeros((p, 3 + p)),
-        ]
-    )
-    D = np.vstack([0.1 * rng.standard_normal((3, 1)), np.zeros((p, 1))])
-    B = np.vstack([rng.standard_normal((3, 1)), np.zeros((p, 1))])
-    return Observer("o", lifting, A, B, (0,), ("u",), gain(D, DT), Injection.STATE, DT, runtime=Runtime(**runtime))  # type: ignore[arg-type]
+N = 600
 
 
-def recordings(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    x = 0.3 * np.tanh(np.cumsum(0.1 * rng.standard_normal((N, 6, 3)), axis=0) + rng.standard_normal((6, 3)))
-    return x, rng.standard_normal((N, 6, 1))
+def observer(functions=(), **runtime) -> Observer:
+    """Corrected by a constant gain."""
+    return contracting(functions, 0, seed=3, radius=0.7, lifted=0.02, **runtime)
 
 
 def errors_of(o: Observer, batch: EpisodeBatch) -> np.ndarray:
@@ -58,7 +41,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_bounds_hold_for_every_unit_and_are_close(case: str, noise: float) -> None:
     functions, runtime, close = CASES[case]
-    o, (x, u) = observer(functions, **runtime), recordings()
+    o, (x, u) = observer(functions, **runtime), recordings(N)
     delay = o.runtime.delay
     y = x[np.maximum(np.arange(N) - delay, 0)] + noise * np.random.default_rng(1).standard_normal(x.shape)
     batch = batch_of(x, u, DT, units=["1", "1", "2", "2", "3", "3"])
@@ -74,7 +57,7 @@ def test_bounds_hold_for_every_unit_and_are_close(case: str, noise: float) -> No
 @pytest.mark.parametrize("case", ["linear", "slopes"])
 def test_bounds_hold_for_combinations_of_recorded_signals(case: str) -> None:
     """A machine is driven by residuals of some units, weighed, of either sign and later, from the first error that follows."""
-    o, (x, u) = observer(CASES[case][0]), recordings()
+    o, (x, u) = observer(CASES[case][0]), recordings(N)
     found = signal_bound(relift_certificate(o), o, batch_of(x, u, DT, units=[str(i) for i in range(6)]))
     estimates = run_observer(o, x[..., :1], u)
     lift, A, B = o.lifting, o.A[:3], o.B[:3]
@@ -96,7 +79,7 @@ def test_bounds_hold_for_combinations_of_recorded_signals(case: str) -> None:
 
 
 def test_recordings_may_be_beyond_limits_by_their_noise() -> None:
-    x, u = recordings()
+    x, u = recordings(N)
     batch = batch_of(x, u, DT, units=["1", "1", "2", "2", "3", "3"])
     free, limited = observer(), observer((), upper=np.array([np.inf, 0.25, np.inf]))
     bounds = [signal_bound(relift_certificate(o), o, batch) for o in (free, limited)]
@@ -109,7 +92,7 @@ def test_recordings_may_be_beyond_limits_by_their_noise() -> None:
 
 
 def test_what_leaves_the_assumptions_has_no_bound() -> None:
-    x, u = recordings()
+    x, u = recordings(N)
     batch = batch_of(x, u, DT, units=["1", "1", "2", "2", "3", "3"])
     refuses = replace(
         observer(), seen=Seen(np.array([float(np.sort(np.abs(x[..., 0]).max(axis=0))[-2]) / 1.5]), np.array([9.0]))

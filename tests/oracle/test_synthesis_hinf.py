@@ -61,7 +61,7 @@ def slow_optimum(p):
 
 def test_slicot_discrete_level():
     # The example asks for 111.294, which is its optimum to all six digits.
-    found = hinf(slicot_discrete())
+    found = hinf(slicot_discrete()[0])
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(111.294, abs=1e-3)
 

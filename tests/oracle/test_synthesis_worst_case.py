@@ -81,19 +81,6 @@ def test_dual_bound_against_optimised_contractions():
         assert dual_bound(0 * a[None], P[None], Q[None])[0] == pytest.approx(largest)
 
 
-def test_the_average_is_that_of_samples_and_the_bound_holds_for_them():
-    rng = np.random.default_rng(3)
-    N, M = np.diag([0.5, 0.2j])[None], np.diag([1.0, 2.0])[None] + 0j
-    T = rng.standard_normal((1, 3, 2)) + 0j
-    ball = Ball.of(N, M)
-    thetas = [contraction(rng.standard_normal(8), 2) for _ in range(20000)]
-    elements = [ball.center[0] + ball.left[0] @ t @ ball.right[0] for t in thetas]
-    sampled = np.mean([x @ x.conj().T for x in elements], axis=0)
-    assert ball.average()[0] == pytest.approx(sampled, abs=0.02 * np.abs(sampled).max())
-    worst = max(np.linalg.norm(T[0] @ (ball.center[0] + ball.left[0] @ t @ ball.right[0])) for t in thetas[:3000])
-    assert worst <= ball.bound(T)[0]
-
-
 @pytest.mark.parametrize(
     "pole", [0.5, 0.999, 0.9999999, 0.999 * np.exp(0.3j), 0.9999999 * np.exp(1e-3j), 0.999999 * np.exp(3.0j)]
 )

@@ -533,7 +533,9 @@ def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():
         kros.identify(pendulums, lifting=["sin(position)"], refine=False), n_freqs=50, max_order=1
     )
     designs = [
-        kros.synthesize(uncertain, f"koopman_edmd/{method}", methods=(), estimator={"folds": 2, "parts": 2})
+        kros.synthesize(
+            uncertain, f"koopman_edmd/{method}", methods=(), estimator={"folds": 2, "parts": 2, "gap_samples": 1200}
+        )
         for method in ("estimator", "open_loop")
     ]
     keys = uncertain.models.facts.test
@@ -556,7 +558,7 @@ def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():
 def two_sensors():
     """A motor of which position and current are measured."""
     population, recordings = recorded_motors(4, 4)
-    observer = estimator(recordings, Lifting(population.states), (0, 2), population.inputs, 1e-3)
+    observer = estimator(recordings, Lifting(population.states), (0, 2), population.inputs, population.sample_period_s)
     return observer, EpisodeBatch.read(population, list(population.keys()))
 
 

@@ -80,13 +80,6 @@ def test_examples_of_documents_run(path: Path) -> None:
     assert run_examples([doctest.DocTestParser().get_doctest(text, {}, path.name, str(path), 0)]) == []
 
 
-@pytest.mark.parametrize("path", PAGES, ids=[path.name for path in PAGES])
-def test_python_of_pages_is_run(path: Path) -> None:
-    """A block is a doctest, or the tutorial's, which `tests/e2e/test_tutorial.py` runs."""
-    python = blocks(path.read_text(encoding="utf-8"), "python")
-    assert path.name == "tutorial.md" or [block for block in python if not block.startswith(">>> ")] == []
-
-
 def command(names: list[str]) -> Any:
     """The command that a line begins with; None if it does not exist."""
     command: Any = typer.main.get_command(app)
@@ -161,8 +154,11 @@ def without_question_or_example(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("path", PAGES, ids=[path.name for path in PAGES])
-def test_pages_begin_with_a_question_and_an_example(path: Path) -> None:
-    assert without_question_or_example(path.read_text(encoding="utf-8")) == []
+def test_pages_begin_with_a_question_and_their_python_is_run(path: Path) -> None:
+    """A block is a doctest, or the tutorial's, which `tests/e2e/test_tutorial.py` runs."""
+    text = path.read_text(encoding="utf-8")
+    assert without_question_or_example(text) == []
+    assert path.name == "tutorial.md" or [b for b in blocks(text, "python") if not b.startswith(">>> ")] == []
 
 
 def test_a_page_without_question_is_found() -> None:

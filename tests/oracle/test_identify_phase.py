@@ -42,16 +42,6 @@ def test_the_published_mean_over_both_directions_cancels_where_this_one_works():
     assert abs(np.sin(unit_phase(segments, "1", SPEC).phase_rad - 1.0)) < 0.02
 
 
-def test_closed_form_equals_the_sampled_maximum():
-    angle, reference, measured = recording(0.8, -0.6)
-    segment = find_segments(angle, reference, measured, DT, SPEC)[0]
-    window = slice(200 + 100, 200 + 1500)
-    error = (reference - measured)[window]
-    grid = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
-    inner = [np.dot(error - error.mean(), np.sin(100 * angle[window] + g)) for g in grid]
-    assert np.abs(np.angle(np.exp(1j * (grid[int(np.argmax(inner))] - segment.phase)))) < 2e-2
-
-
 @pytest.mark.parametrize("mean_lag", [-0.7, -np.pi / 2, -2.9])
 def test_branches_are_resolved_for_the_whole_population(mean_lag):
     """Every unit must land on the same branch, also where lags straddle 90 degrees; one pi common to all is free."""

@@ -70,15 +70,6 @@ def test_without_friction_error_and_gravity_it_is_a_linear_two_mass_system():
 
 def test_a_population_is_one_for_a_study():
     population, _ = drive.simulate(n_units=1, n_episodes=1, seconds=2.0, seed=3)
-    assert (population.states, population.inputs) == (
-        ("position", "velocity", "current"),
-        ("target_position", "target_velocity"),
-    )
-    assert (population.measured, population.true_states, population.conditions) == (
-        ("position",),
-        (1,),
-        ("load", "noload"),
-    )
     states, inputs = population.read_parts(population.episodes[0])
     true = population.read_with_truths(population.episodes[0])[1][:, 0]
     travelled = np.concatenate([[0.0], np.cumsum(true[1:] + true[:-1])]) * drive.PERIOD_S / 2

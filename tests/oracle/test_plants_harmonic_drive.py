@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.dynamics import GAINS, VELOCITY_POLE, DriveParameters, Physics, simulate
+from kros.plants.harmonic_drive.dynamics import VELOCITY_POLE, DriveParameters, Physics
 from kros.plants.harmonic_drive.population import MAX_SPEED
 
 PERIOD = 1e-3
@@ -126,22 +126,6 @@ def test_physics_agree_with_a_general_integrator(loaded):
             assert physics.q[0] == pytest.approx(x[0], abs=2e-4)
             assert physics.z[1, 0] == pytest.approx(x[1], abs=0.01)
             assert physics.z[3, 0] == pytest.approx(x[4], abs=1e-9)
-
-
-@pytest.mark.parametrize("loop", list(GAINS))
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_at_constant_speed_current_is_friction_and_the_position_error_vanishes(loop, direction):
-    p = drives_of(9, 5)
-    speed = direction * 0.8 * MAX_SPEED
-    n = 6000
-    velocity = np.clip(np.arange(n) / 500.0, 0, 1) * speed
-    position = np.cumsum(velocity) * PERIOD
-    states, _, _ = simulate(p, np.zeros(5), np.zeros(5, int), (position[None], velocity[None]), GAINS[loop])
-    tail = slice(n - 2000, n)  # 80 motor revolutions
-    friction = (p.dry_friction(np.full(5, speed)) + p.viscous_friction * speed) / p.torque_constant
-    np.testing.assert_allclose(states[:, 2, tail].mean(axis=1), friction, atol=2e-3)
-    np.testing.assert_allclose(states[:, 0, tail].mean(axis=1), position[tail].mean(), atol=5e-6)
-    np.testing.assert_allclose(states[:, 1, tail].mean(axis=1), speed, atol=1e-4)
 
 
 def test_at_rest_the_load_torque_is_gravity_and_the_current_holds_it(drives):

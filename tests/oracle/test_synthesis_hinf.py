@@ -11,12 +11,6 @@ from kros.core import StateSpace, hinf_norm
 from kros.synthesis import GeneralizedPlant, Status, h2, hinf
 
 
-def scherer(C1, D12):
-    """Example 7 of Scherer, Gahinet and Chilali, IEEE Trans. Automatic Control 42 (1997) 907."""
-    C, D = [*C1, [0, 1, 0]], [*([0, d] for d in D12), [2, 0]]
-    return partition([[0, 10, 2], [-1, 1, 0], [0, 2, -5]], [[1, 0], [0, 1], [1, 0]], C, D, 1, 1, 0.0)
-
-
 def coprime(A, B, C, dt):
     """Robust stabilisation of normalised coprime factors as a four-block problem: w1 at the input, w2 at the output, z
     = (y, u)."""
@@ -64,12 +58,6 @@ def test_slicot_discrete_level():
     found = hinf(slicot_discrete()[0])
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(111.294, abs=1e-3)
-
-
-def test_scherer_example():
-    found = hinf(scherer([[1, 0, 0], [0, 0, 0]], [0, 1]))
-    assert found.hinf_norm == pytest.approx(9.508, abs=5e-4)
-    assert h2(scherer([[0, 1, 0], [0, 0, 1], [0, 0, 0]], [0, 0, 1])).h2_norm == pytest.approx(7.748, abs=5e-4)
 
 
 def test_zhou_doyle_glover_h2_example():

@@ -159,17 +159,6 @@ def test_exact_when_the_set_is_a_scaled_identity():
     assert found.controller.n_states == 0
 
 
-def test_remainder_enters_bound_and_design():
-    without = problem(4)
-    left = block_diagonal([lag(0.01, 0.05, 10.0) for _ in range(4)])
-    case = problem(4, remainder_left=left, remainder_right=gain(np.eye(2), DT))
-    plain = worst_case_h2(without)
-    found = worst_case_h2(case)
-    assert found.worst_case_h2 > plain.worst_case_h2
-    assert found.worst_case_h2 <= certify_errors(case, case.error_system(plain.controller)) * (1 + 1e-6)
-    assert found.lower_bound <= found.worst_case_h2
-
-
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.7, np.pi])
 def test_a_certificate_sees_resonances_that_a_grid_passes_over(angle):
     """A scalar perturbation of the input: the worst case is the norm of the plant, whose whole energy is in a band of a

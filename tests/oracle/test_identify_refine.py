@@ -65,13 +65,6 @@ def test_known_matrices_are_recovered_through_measurement_noise(lifting: Lifting
     assert np.abs(rows(models) - W).max() < 0.5 * np.abs(one_step - W).max()
 
 
-@pytest.mark.parametrize("lifting", [KOOPMAN, LINEAR], ids=["koopman", "linear"])
-def test_exact_data_give_exact_models(lifting: Lifting) -> None:
-    population, keys, parameters, factor, W = simulated(lifting, 2, 0.0, seed=5, spread=0.0)
-    models = refine_population(population, keys, lifting, parameters, factor, options=OPTIONS)
-    np.testing.assert_allclose(rows(models), W, atol=1e-6)
-
-
 def test_gradient_of_barrier_and_prior_is_that_of_finite_differences() -> None:
     rng = np.random.default_rng(1)
     T = np.eye(3) + 0.1 * rng.normal(size=(3, 3))

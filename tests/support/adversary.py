@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from kros.core.errors import DimensionError
 from kros.observer import Observer
 from kros.observer.certificate.certificate import ReliftCertificate
 from kros.observer.certificate.error import ErrorSystem
@@ -47,10 +46,7 @@ class Attack:
 
 def attack(certificate: ReliftCertificate, observer: Observer, *, steps: int = 100_000, seed: int = 0) -> Attack:
     """Search for disturbances and slopes that exceed a certificate; no measurement is dropped."""
-    if certificate.gain is None:
-        raise DimensionError(
-            f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first."
-        )
+    assert certificate.gain is not None, certificate.reason
     system = certificate.system(observer)
     rng = np.random.default_rng(seed)
     radius = float(np.abs(np.linalg.eigvals(system.A)).max(initial=0.0))
@@ -198,10 +194,7 @@ def attack_running(
 
     `disturbance` is as `attack` leaves it, `start` is (batch, n), `inputs` (at least n_samples + 1, batch, m); amplitudes are RMS.
     """
-    if certificate.gain is None:
-        raise DimensionError(
-            f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first."
-        )
+    assert certificate.gain is not None, certificate.reason
     observer = replace(observer, seen=None)  # the disturbances are to arrive
     rng, lifting, scales = np.random.default_rng(seed), observer.lifting, certificate.scales
     n, steps, batch = lifting.n_states, len(disturbance), len(start)

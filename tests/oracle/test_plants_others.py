@@ -1,4 +1,4 @@
-"""The simulated DC motors against steady states on paper, the matrix exponential and a general integrator."""
+"""The simulated DC motors and pendulums against steady states on paper and a general integrator."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from kros.plants import DcMotorPopulation
+from kros.plants import DcMotorPopulation, PendulumPopulation
 from kros.plants.dc_motor import DcMotorTruth
 
 
@@ -58,3 +58,17 @@ def test_the_outlier_loses_more_of_its_voltage_to_friction():
     friction = truth.coulomb * truth.resistance / truth.torque_constant  # volts that it costs
     assert friction[0] > 3 * friction[1]
     assert truth.coulomb[0] == pytest.approx(np.e * truth.coulomb[1])
+
+
+def test_pendulums_agree_with_a_general_integrator():
+    simulated = PendulumPopulation(n_units=1, n_episodes=1, seconds=3.0, seed=2).simulate()
+    truth, recorded = simulated.truth, simulated.population.read(simulated.population.episodes[0])
+    x = np.zeros(2)
+    for k, torque in enumerate(recorded[:, 2]):
+        assert recorded[k, 0] == pytest.approx(x[0], abs=1e-3)  # the encoder's resolution is 1.5 mrad
+        assert recorded[k, 1] == pytest.approx(x[1], abs=0.06)  # six standard deviations of the noise
+
+        def rhs(_, s, torque=torque):
+            return [s[1], -truth.gravity[0] * np.sin(s[0]) - truth.damping[0] * s[1] + truth.gain[0] * torque]
+
+        x = solve_ivp(rhs, (0, 0.01), x, rtol=1e-9, atol=1e-12).y[:, -1]

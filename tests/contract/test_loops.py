@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -51,7 +52,7 @@ def assert_same(found, wanted):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12 * size)
 
 
-def machines_of(count=350, lost=True):
+def machines_of(count=250, lost=True):
     """Faulty samples of machines that differ, shape (count, machine, ...), and their phases; perhaps no input is lost."""
     y, u = (
         np.stack(of, axis=1)
@@ -147,9 +148,8 @@ FLAGS = ("-fPIC", "-shared")
 
 @needs_compiler
 def test_two_processes_may_compile_at_once(tmp_path):
-    program = f"from kros.loops import compiler; assert compiler.load({SOURCE!r}, {FLAGS!r}).kros_answer() == 42"
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
-    both = [subprocess.Popen([sys.executable, "-c", program], env=environment) for _ in range(2)]
+    both = [subprocess.Popen([sys.executable, "-c", ANSWER], env=environment) for _ in range(2)]
     assert [process.wait() for process in both] == [0, 0]
     assert sorted(path.suffix for path in (tmp_path / "kros").iterdir()) == [".sha256", ".so"]
 
@@ -196,20 +196,30 @@ def test_without_a_compiler_that_works_numpy_takes_over_and_says_so_once(tmp_pat
     library.cache_clear()
 
 
+ANSWER = f"from kros.loops import compiler; assert compiler.load({SOURCE!r}, {FLAGS!r}).kros_answer() == 42"
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A folder in which a library was compiled."""
+    folder = tmp_path_factory.mktemp("cache")
+    subprocess.run([sys.executable, "-c", ANSWER], env=os.environ | {"XDG_CACHE_HOME": str(folder)}, check=True)
+    return folder
+
+
 @needs_compiler
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty", "checksum"])
-def test_a_damaged_library_is_compiled_again(damage, tmp_path, monkeypatch):
+def test_a_damaged_library_is_compiled_again(damage, cache, tmp_path, monkeypatch):
     """A library that is cut short would end the process with SIGBUS at its first call."""
+    shutil.copytree(cache, tmp_path, dirs_exist_ok=True)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    program = f"from kros.loops import compiler; assert compiler.load({SOURCE!r}, {FLAGS!r}).kros_answer() == 42"
-    subprocess.run([sys.executable, "-c", program], check=True)
     built, checksum = (next((tmp_path / "kros").glob(f"*.{ending}")) for ending in ("so", "sha256"))
     whole = built.read_bytes()
     if damage == "checksum":
         checksum.write_bytes(b"\xff")
     else:
         built.write_bytes({"cut": whole[: len(whole) // 2], "changed": whole[:-1] + b"x", "empty": b""}[damage])
-    subprocess.run([sys.executable, "-c", program], check=True)
+    subprocess.run([sys.executable, "-c", ANSWER], check=True)
     assert compiler._is_whole(built)
 
 

@@ -98,17 +98,21 @@ def test_a_scaled_population_is_divided_and_nothing_else(motors):
     check_episode(scaled.read(key), key, scaled.channels)
 
 
+@pytest.fixture(scope="module")
+def drive():
+    return HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=8.0, seed=1).simulate().population
+
+
 @pytest.mark.parametrize("factors", [(1e-9, 1, 1), (1, 1e9, 1), (1, 1, 1e-9), (1e9, 1e-9, 1e9)])
-def test_phases_and_lags_are_those_of_the_machine(factors):
-    population = HarmonicDrivePopulation(n_units=1, n_episodes=1, seconds=8.0, seed=1).simulate().population
-    values = population.read(population.episodes[0])
-    names = population.states + population.inputs
+def test_phases_and_lags_are_those_of_the_machine(drive, factors):
+    values = drive.read(drive.episodes[0])
+    names = drive.states + drive.inputs
     columns = [values[:, names.index(n)] for n in ("position", "target_velocity", "velocity")]
     spec = PhaseSpec()
-    one = find_segments(*columns, population.sample_period_s, spec)
+    one = find_segments(*columns, drive.sample_period_s, spec)
     scaled = find_segments(
         *(c * f for c, f in zip(columns, factors, strict=True)),
-        population.sample_period_s,
+        drive.sample_period_s,
         replace(spec, ratio=spec.ratio / factors[0]),
     )
     assert len(scaled) == len(one) > 1

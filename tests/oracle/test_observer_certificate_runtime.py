@@ -21,11 +21,14 @@ def late(states: np.ndarray, delay: int) -> np.ndarray:
     return states[np.maximum(np.arange(len(states)) - delay, 0)][..., :1]
 
 
+LINEAR = [(), ("a[-1]",), ("b[-2]", "a[-1]")]
+BENT = [("sin(2*a)",), ("sin(a + b)", "u[-1]*1"), ("cos(b[-1])",)]
+
+
 @pytest.mark.parametrize(
-    "functions", [(), ("a[-1]",), ("b[-2]", "a[-1]"), ("sin(2*a)",), ("sin(a + b)", "u[-1]*1"), ("cos(b[-1])",)]
-)
-@pytest.mark.parametrize(
-    ("delay", "injection"), [(0, Injection.STATE), (0, Injection.INPUT), (1, Injection.STATE), (4, Injection.STATE)]
+    ("delay", "injection", "functions"),
+    [(0, injection, functions) for injection in (Injection.STATE, Injection.INPUT) for functions in LINEAR + BENT]
+    + [(delay, Injection.STATE, functions) for delay in (1, 4) for functions in LINEAR],
 )
 def test_the_error_system_is_the_observer_as_it_runs(delay, injection, functions) -> None:
     """Start, chain of predictions and correction filter: linear functions leave nothing to bound, and the frozen response is the error, to rounding."""

@@ -432,7 +432,7 @@ def from_rest(places: list[float], seed: int) -> tuple[Recordings, dict]:
 
 def test_machines_recorded_from_rest_are_estimated_where_they_start_in_motion_too():
     lifting = Lifting(("position", "velocity"))
-    rng, settings = np.random.default_rng(3), {"delays": 16, "rows": 6000, "start_share": 1e-12}
+    rng, settings = np.random.default_rng(3), {"delays": 16, "rows": 6000, "start_share": 1e-12, "gap_samples": 1200}
     recordings, _ = from_rest(list(rng.uniform(-2, 2, 6)), 1)
     unseen = from_rest(list(rng.uniform(-2, 2, 4)), 2)[1]
     errors = []
@@ -472,7 +472,7 @@ def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well()
     recordings = Recordings.of([key for key in batches if key.episode != "5"], batches.__getitem__)
     errors = []
     for shares in ({"start_share": 1e-12, "restart_share": 1e-12}, {}):
-        chosen = EstimatorSettings(delays=16, rows=6000, **shares)
+        chosen = EstimatorSettings(delays=16, rows=6000, gap_samples=1200, **shares)
         observer = estimator(recordings, Lifting(("position", "velocity")), settings=chosen)
         unseen = [b for key, b in batches.items() if key.episode == "5"]
         off = [run_observer(observer, b.states[..., :1], b.inputs)[:50, 0, 1] - b.states[:50, 0, 1] for b in unseen]

@@ -65,6 +65,7 @@ class MagnitudeRule:
 
     floor: float = 1e-8  # of the largest magnitude: smaller ones count as that (-160 dB)
     exact_db: float = 1e-4  # excess that counts as none
+    worth_db: float = 0.1  # by which a further pole and zero have to lower the excess
     highest: float = 10.0  # tau of the highest knot: 80 % of Nyquist
     rounds: int = 6  # of programs: frequencies at which n or d vanish between points join them
     edge: float = 1e-4  # share to which n and d may fall between the ends of the grid and DC or Nyquist

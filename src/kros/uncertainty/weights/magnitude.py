@@ -144,7 +144,8 @@ def rising_bounds(tau: AnyArray, magnitude: AnyArray, max_order: int, enough_db:
     bound = Bound(Sections.of_roots(np.log(top) / 2, none, none), 10 * float(np.log10(top / targets.min())))
     for order in range(max_order + 1):
         if order and bound.excess_db > max(enough_db, MAGNITUDE.exact_db):
-            bound = _better(tau, targets, order, bound)
+            richer = _better(tau, targets, order, bound)
+            bound = richer if richer.excess_db < bound.excess_db - MAGNITUDE.worth_db else bound
         yield replace(bound, sections=replace(bound.sections, level=bound.sections.level + unit))
 
 

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kros.core import DimensionError, KrosError, StateSpace, gain, h2_norm, hinf_norm
-from kros.core.linalg import radius_text
 
 
 @pytest.mark.parametrize(("pole", "dt"), [(1.0, 1.0), (-1.2, 1.0), (0.0, 0.0), (0.5, 0.0)])
@@ -52,18 +51,3 @@ def test_bad_input_is_named():
         hinf_norm(gain([[np.nan]], 1.0))
     with pytest.raises(KrosError, match="tol"):
         hinf_norm(gain([[1.0]], 1.0), tol=0)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (1 - 2.5e-8, "1 - 2.5e-08"),
-        (1 + 3e-12, "1 + 3e-12"),
-        (1.0, "1"),
-        (0.5, "0.5"),
-        (0.99987, "0.99987"),
-        (1.2, "1.2"),
-    ],
-)
-def test_spectral_radius_is_told_from_one(value, text):
-    assert radius_text(value) == text

@@ -30,13 +30,9 @@ def samples(seed: int) -> np.ndarray:
     return np.column_stack([np.arange(N) * 0.01, rng.standard_normal((N, 2))])
 
 
-def write(
-    path: Path, values: np.ndarray, header: str | None = "t,pos,volt", delimiter: str = ",", end: str = "\n"
-) -> None:
+def write(path: Path, values: np.ndarray, header: str = "t,pos,volt\n", delimiter: str = ",", end: str = "\n") -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = (
-        end.join(([header] if header else []) + [delimiter.join(repr(float(v)) for v in row) for row in values]) + end
-    )
+    text = header + "".join(delimiter.join(repr(float(v)) for v in row) + end for row in values)
     path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
 
 
@@ -46,10 +42,8 @@ def mapping(**changes: Any) -> dict[str, Any]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for seed, name in enumerate(
-        ["a/cold_1.csv", "a/cold_2.csv", "b/cold_1.csv", "b/cold_10.csv", "b/cold_2.csv", "b/warm_1.csv"]
-    ):
-        write(tmp_path / name, samples(seed))
+    for seed, name in enumerate(["a/cold_1", "a/cold_2", "b/cold_1", "b/cold_10", "b/cold_2", "b/warm_1"]):
+        write(tmp_path / f"{name}.csv", samples(seed))
     (tmp_path / "notes.csv.bak").write_text("nothing")
     return tmp_path
 
@@ -67,7 +61,7 @@ def test_values_keys_and_channels(folder: Path) -> None:
 
 def test_several_units_in_one_file(tmp_path: Path) -> None:
     values = np.column_stack([samples(0), samples(1)[:, 1:]])
-    write(tmp_path / "rig_1.csv.gz", values, "t,pos1,volt1,pos2,volt2")
+    write(tmp_path / "rig_1.csv.gz", values, "t,pos1,volt1,pos2,volt2\n")
     units = [{"suffix": f"/joint{j}", "columns": {"x": f"pos{j}", "u": f"volt{j}"}} for j in (1, 2)]
     channel = [{k: v for k, v in c.items() if k not in ("column", "scale")} for c in CHANNEL]
     population = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>\w+)_(?P<episode>\d)", channel=channel, unit=units))
@@ -78,7 +72,7 @@ def test_several_units_in_one_file(tmp_path: Path) -> None:
 def test_tab_separated_without_header(tmp_path: Path) -> None:
     values = samples(0)
     values[:, 0] *= 1000
-    write(tmp_path / "a_1.tsv", values, None, "\t", "\r\n")
+    write(tmp_path / "a_1.tsv", values, "", "\t", "\r\n")
     channel = [{**CHANNEL[0], "column": 3}, {**CHANNEL[1], "column": 2}]
     table = mapping(
         files=r"(?P<unit>a)_(?P<episode>\d)", channel=channel, time=1, time_scale=1e-3, header=False, delimiter="\t"
@@ -95,19 +89,6 @@ def read_first(folder: Path, unit: str = "a") -> Population:
     population = read_csv_folder(folder, MAPPING)
     population.read(EpisodeKey(unit, "cold", "1"))
     return population
-
-
-@pytest.mark.parametrize(
-    ("header", "message"),
-    [
-        ("t,position,volt", r"cold_1\.csv: column 'pos' is missing; found \['t', 'position', 'volt'\]"),
-        ("t,pos,pos", "column 'pos' occurs 2 times"),
-    ],
-)
-def test_columns_that_are_missing_or_double(folder: Path, header: str, message: str) -> None:
-    write(folder / "b" / "cold_1.csv", samples(0), header)
-    with pytest.raises(DataError, match=message):
-        read_csv_folder(folder, MAPPING)
 
 
 @pytest.mark.parametrize(
@@ -131,20 +112,15 @@ def test_bad_rows(folder: Path, row: str, message: str) -> None:
 def test_duplicates_and_no_match(folder: Path) -> None:
     with pytest.raises(DataError, match=r"Duplicate episodes: episode 1 of unit b \(default\)"):
         read_csv_folder(folder, mapping(files=r"(?P<unit>[^/]+)/\w+_(?P<episode>\d+)\.csv"))
-    with pytest.raises(
-        DataError, match=r"no file matches files = 'run\\\\d', there are 6 files such as 'a/cold_1\.csv'"
-    ):
+    match = r"no file matches files = 'run\\\\d', there are 6 files such as 'a/cold_1\.csv'"
+    with pytest.raises(DataError, match=match):
         read_csv_folder(folder, mapping(files=r"run\d"))
-    (folder / "empty").mkdir()
-    with pytest.raises(DataError, match=r"no file matches.*there is no file that ends in \.csv"):
-        read_csv_folder(folder / "empty", MAPPING)
 
 
 def test_another_rate(folder: Path) -> None:
     write(folder / "b" / "cold_1.csv", samples(0) * [2, 1, 1])
-    with pytest.raises(
-        DataError, match=r"unit b \(cold\).* not the 0\.01 s of episode 1 of unit a \(cold\): found steps of 0\.02 s"
-    ):
+    match = r"unit b \(cold\).* not the 0\.01 s of episode 1 of unit a \(cold\): found steps of 0\.02 s"
+    with pytest.raises(DataError, match=match):
         read_first(folder, "b")
 
 
@@ -173,10 +149,7 @@ def test_another_rate(folder: Path) -> None:
         ({"delimiter": "::"}, "two different characters .* found delimiter = '::'"),
         ({"decimal": ","}, "two different characters"),
         ({"skip_rows": -1}, "skip_rows: input should be greater than or equal to 0, found -1"),
-        (
-            {"unit": [{"suffix": "1", "columns": {"z": "pos"}}]},
-            r"gives a column for 'z'; channels are \['u', 'x'\]",
-        ),
+        ({"unit": [{"suffix": "1", "columns": {"z": "pos"}}]}, r"gives a column for 'z'; channels are \['u', 'x'\]"),
     ],
 )
 def test_mapping_refuses(folder: Path, changes: dict[str, Any], message: str) -> None:
@@ -219,10 +192,7 @@ def test_timestamps_over_the_turn_of_a_year(tmp_path: Path, text: str) -> None:
     order = {"3": "dmy", "2": "ymd", "1": "mdy"}[text[0]]
     turned = {"dmy": "01.01.2024 00:00:00,", "ymd": "2024-01-01T00:00:00.", "mdy": "01/01/2024 00:00:00."}[order]
     zone = text[23:] if order == "ymd" else ""
-    rows = [
-        f"{text};1;2",
-        *(f"{turned}{'0' if k == 0 else '5'}{zone};{k};{k * k}" for k in range(2)),
-    ]
+    rows = [f"{text};1;2", *(f"{turned}{5 * k}{zone};{k};{k * k}" for k in range(2))]
     (tmp_path / "a.csv").write_text("\n".join(["t;pos;volt", *rows]))
     population = read_csv_folder(tmp_path, mapping(files="a", delimiter=";", timestamp=order))
     assert population.sample_period_s == 0.5
@@ -236,37 +206,29 @@ def test_milliseconds_since_1970_lose_nothing(tmp_path: Path, time: str, scale: 
     assert read_csv_folder(tmp_path, mapping(files="a", **scale)).sample_period_s == 0.002
 
 
-@pytest.mark.parametrize("gap", [0.0, 0.05])
-def test_a_long_file_of_which_some_rows_are_written_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gap: float
-) -> None:
+def test_a_long_file_of_which_some_rows_are_written_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "BLOCK", 1 << 12)
     values = np.column_stack([np.arange(2000) * 0.01, np.random.default_rng(0).standard_normal((2000, 2))])
-    values[1500:, 0] += gap
     write(tmp_path / "a_1.csv", np.repeat(values, 1 + (np.arange(2000) % 100 == 7), axis=0))  # some are written twice
     population = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>a)_(?P<episode>\d)", sample_period_s=None))
     (key,) = population.episodes
-    if gap:
-        with pytest.raises(DataError, match="uneven time"):
-            population.read(key)
-        return
     np.testing.assert_allclose(population.read(key) * [1000, 1], values[:, 1:], rtol=1e-9)  # mm are read as m
 
 
 def test_time_is_converted_file_by_file_as_other_columns_are(tmp_path: Path) -> None:
     plain = samples(0)
     for name, unit, factor in (("a/cold_1.csv", "s", 1.0), ("a/cold_2.csv", "ms", 1e3)):
-        write(tmp_path / name, (plain + np.array([0, factor, 0])) * [factor, 1, 1], f"t,pos,volt\n{unit},mm,V")
+        write(tmp_path / name, (plain + np.array([0, factor, 0])) * [factor, 1, 1], f"t,pos,volt\n{unit},mm,V\n")
     one = read_csv_folder(tmp_path, mapping(unit_rows=1))
     assert one.sample_period_s == 0.01
     assert [len(one.read(key)) for key in one.episodes] == [N, N]
     with pytest.raises(DataError, match=r"cold_2\.csv: column 't' is in 'ms', and in another file in 's'"):
         read_csv_folder(tmp_path, mapping(time_scale=1.0, unit_rows=1))
     for name, unit in (("a/cold_1.csv", "seconds"), ("a/cold_2.csv", "s")):  # one unit, in two spellings
-        write(tmp_path / name, plain + np.array([0, len(unit), 0]), f"t,pos,volt\n{unit},counts,V")
+        write(tmp_path / name, plain + np.array([0, len(unit), 0]), f"t,pos,volt\n{unit},counts,V\n")
     assert read_csv_folder(tmp_path, mapping(unit_rows=1)).sample_period_s == 0.01
     assert read_csv_folder(tmp_path, mapping(time_scale=1e-3, unit_rows=1)).sample_period_s == 1e-5
-    write(tmp_path / "a/cold_1.csv", plain, "t,pos,volt\nrad,counts,V")
+    write(tmp_path / "a/cold_1.csv", plain, "t,pos,volt\nrad,counts,V\n")
     with pytest.raises(DataError, match=r"column 't' is in 'rad', and declared in 's'"):
         read_csv_folder(tmp_path, mapping(unit_rows=1))
 

@@ -1,13 +1,12 @@
 """Names, selections and the split."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, split_episodes, write_parquet
+from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, split_episodes
 from kros.data.population import natural_key
 from kros.data.prepare import assemble
 from kros.data.readers.arrays import ArrayRecordings
@@ -56,18 +55,6 @@ def test_split_by_name_and_its_refusals() -> None:
         split_episodes(whole, ["0", "1", "2", "3"])
     with pytest.raises(DataError, match=r"unit a \(hot\) into training and test needs at least two, found 1"):
         split_episodes(population({("a", "hot"): 1}))
-
-
-def test_order_of_what_is_given_does_not_matter(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    episodes = {
-        EpisodeKey(u, c, str(e)): rng.standard_normal((9, 2)) for u in "ab" for c in ("hot", "cold") for e in (1, 2, 10)
-    }
-    shuffled = [list(episodes.items())[i] for i in rng.permutation(len(episodes))]
-    for name, given_ in (("one", episodes), ("two", dict(shuffled))):
-        write_parquet(from_arrays(given_, CHANNELS, 0.1), tmp_path / name)
-    for path in (tmp_path / "one").iterdir():
-        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
 
 def test_inputs_before_states_are_refused_where_columns_are_fixed() -> None:

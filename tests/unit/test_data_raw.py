@@ -124,11 +124,3 @@ def test_names_that_do_not_fit(raw: Path) -> None:
     write_file(raw / "batch_b" / "population" / "notes" / "cycle_001.csv", truth(3))
     with pytest.raises(DataError, match=r"notes/cycle_001\.csv should be named"):
         read_motor_drive_raw(raw)
-
-
-def test_no_layout_and_no_files(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="found no folder 'population' or 'outliers'"):
-        read_motor_drive_raw(tmp_path)
-    folder(tmp_path, "000001").mkdir(parents=True)
-    with pytest.raises(DataError, match="no file matches files"):
-        read_motor_drive_raw(tmp_path)

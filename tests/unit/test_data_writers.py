@@ -2,8 +2,6 @@
 
 import json
 import string
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +43,6 @@ def assert_same(found: Population, expected: Population) -> None:
     assert found.metadata == expected.metadata
     for key in expected.episodes:
         np.testing.assert_array_equal(found.read(key), expected.read(key))
-
-
-def test_round_trip_is_exact(tmp_path: Path) -> None:
-    write_parquet(population(), tmp_path / "out")
-    assert_same(read_parquet(tmp_path / "out"), population())
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
 
 
 def test_files_as_documented(tmp_path: Path) -> None:
@@ -172,19 +164,3 @@ def test_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
     found.read(key)
     (tmp_path / "two" / "a@cold.parquet").replace(tmp_path / "one" / "a@cold.parquet")
     np.testing.assert_array_equal(found.read(key), population(("b", "a")).read(key))
-
-
-def test_reading_and_writing_leave_pandas_alone(tmp_path: Path) -> None:
-    """Workers start without the half second that pandas costs."""
-    (tmp_path / "csv").mkdir()
-    (tmp_path / "csv" / "a.csv").write_text("t,x\n0,1\n0.1,2\n0.2,4\n")
-    code = """
-import sys
-from kros.data import read, write_parquet
-table = {"files": "a", "time": "t", "channel": [{"name": "x", "column": "x", "role": "state"}]}
-write_parquet(read(sys.argv[1] + "/csv", "csv", mapping=table), sys.argv[1] + "/out")
-population = read(sys.argv[1] + "/out")
-assert population.read(population.episodes[0]).ravel().tolist() == [1, 2, 4]
-assert "pandas" not in sys.modules
-"""
-    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=60)

@@ -40,21 +40,6 @@ def test_harmonics_of_an_angle_with_a_phase():
     assert len(separation.basis) == 4
 
 
-@pytest.mark.parametrize(("degree", "n_terms"), [(2, 6), (3, 16), (4, 31)])
-def test_polynomials_have_every_monomial_once(degree, n_terms):
-    functions = polynomials(STATES, degree)
-    assert len(set(functions)) == n_terms  # (3 + d choose d) - 1 - 3
-    exponents = [[f.count(f"{s}**{k}") * k for s in STATES for k in range(2, 5)] for f in functions]
-    assert max(map(max, exponents)) == degree
-    found = values(functions)
-    for f, column in zip(functions, found.T, strict=True):
-        expected = np.ones(200)
-        for factor in f.replace("**", "^").split("*"):
-            name, _, power = factor.partition("^")
-            expected *= X[:, STATES.index(name)] ** int(power or 1)
-        np.testing.assert_allclose(column, expected, rtol=1e-12)
-
-
 def test_families_work_on_the_values_of_other_functions():
     functions = polynomials(["sin(position)", "velocity"], 2)
     assert functions == ("(sin(position))**2", "(sin(position))*velocity", "velocity**2")

@@ -5,7 +5,6 @@ import pytest
 from random_models import random_observer
 
 from kros.core.errors import DataError, DimensionError
-from kros.data import EpisodeBatch
 from kros.lifting import Lifting
 from kros.observer import Observer, SampleStatus, run_observer
 from kros.synthesis import Injection
@@ -57,29 +56,3 @@ def test_masked_measurements_are_missing_and_text_is_refused():
         o.start([0.5]).step(["full"], [1.0, 2.0])
     with pytest.raises(DataError, match=r"inputs should be numbers, found \[\[1.0\], \[2.0, 3.0\]\]"):
         o.start([0.5]).step([0.5], [[1.0], [2.0, 3.0]])
-
-
-def test_open_loop_equals_a_free_run_from_the_first_measurement():
-    from kros.identify import free_run
-
-    o = random_observer(LIFTING)
-    silent = Observer.open_loop("open", LIFTING, o.A, o.B, (0,), ("a", "b"), 0.001)
-    rng = np.random.default_rng(2)
-    y, u = rng.normal(size=(30, 4, 1)), rng.normal(size=(30, 4, 2))
-    x0 = np.concatenate([y[0], np.zeros((4, 2))], axis=1)
-    free = free_run(o.A, o.B, LIFTING, {"phase": 0.7}, x0, np.swapaxes(u, 0, 1))
-    np.testing.assert_allclose(
-        np.swapaxes(run_observer(silent, y, u, {"phase": np.full(4, 0.7)}), 0, 1), free, rtol=1e-12, atol=1e-12
-    )
-
-
-def test_episodes_of_different_length_are_held_at_their_end():
-    from kros.data import Channel, Role, from_arrays
-
-    rng = np.random.default_rng(3)
-    channels = [Channel("x", Role.STATE, "", True), Channel("u", Role.INPUT)]
-    data = {"1": [rng.normal(size=(30, 2)), rng.normal(size=(20, 2))]}
-    population = from_arrays(data, channels, 0.1)
-    batch = EpisodeBatch.read(population, population.episodes)
-    assert batch.lengths.tolist() == [30, 20]
-    np.testing.assert_array_equal(batch.states[20:, 1], np.broadcast_to(batch.states[19, 1], (10, 1)))

@@ -36,19 +36,6 @@ def uncertain(population: Population) -> UncertainModels:
     return kros.quantify(models, n_freqs=60, max_order=1)
 
 
-def test_from_arrays_to_a_step(uncertain: UncertainModels, population: Population) -> None:
-    design = kros.synthesize(uncertain, method="kalman_tuned")
-    x = population.read(population.keys()[0])
-    n = len(population.states)
-    running = design.observer.start(x[0, :1])
-    for row in x[:50]:
-        estimate = running.step(row[:1], row[n:])
-    assert running.states == population.states
-    assert estimate["velocity"] == np.asarray(estimate)[running.states.index("velocity")]
-    assert design.name == "linear_edmd/kalman_tuned"
-    assert design.facts["hidden_error_percent"] > 0
-
-
 class Refusing(OpenLoop):
     """A method that is for no kind of model."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import kros
 from kros.core.errors import ConfigError, IdentificationError
 from kros.data import Population, from_arrays
 from kros.data.population import EpisodeKey
-from kros.identify.identified import IdentifiedModels
 from kros.plants import PLANTS
 
 
@@ -56,13 +54,6 @@ def test_a_mapping_of_csv_columns_is_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_the_working_folder_does_not_matter(tmp_path, monkeypatch):
-    given = population()
-    before = groups(given, tmp_path / "run")
-    monkeypatch.chdir(tmp_path)
-    assert groups(given, tmp_path / "run") == before
-
-
 def drives(unsteady: str, condition: str) -> Population:
     """Drives, one of which never runs at constant velocity and is recorded in a condition of its own."""
     whole = (
@@ -90,13 +81,6 @@ def test_a_condition_whose_units_cannot_be_calibrated_has_no_models():
     assert set(models.sizes) == set(given.states + given.inputs)
     with pytest.raises(IdentificationError, match="No unit could be calibrated in 'load'"):
         kros.identify(given, refine=False, identify_on="load")
-
-
-def test_models_in_a_folder_can_be_sent_to_another_process(tmp_path):
-    kros.run(population(), tmp_path / "run", until="identify", identify={"refine": False})
-    loaded = IdentifiedModels.load(tmp_path / "run")
-    again = pickle.loads(pickle.dumps(loaded))
-    np.testing.assert_array_equal(again.models().A, loaded.models().A)
 
 
 def test_a_sensor_is_that_of_a_measured_state(tmp_path):

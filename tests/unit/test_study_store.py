@@ -101,11 +101,6 @@ def test_results_come_back_bit_by_bit(tmp_path, kind, value):
     assert repr(again) == repr(value)
 
 
-def test_a_result_of_another_kind_is_refused(tmp_path):
-    with pytest.raises(TypeError, match="object is not JSON"):
-        stored(lambda task: task, (tmp_path / "a", [object()]))
-
-
 def test_results_of_a_map_that_was_interrupted_are_there(tmp_path):
     work = Work(results=Results(tmp_path, "source"))
     assert next(work.recall("square", square, [2.0, 3.0], ["a", "b"])) == 4.0

@@ -18,16 +18,12 @@ NAMES = ("position", "velocity", "phase")
         ("-abs(velocity)/(1 + position**2)", lambda p, v, q: -np.abs(v) / (1 + p**2)),
         ("tanh(velocity/0.05)", lambda p, v, q: np.tanh(v / 0.05)),
         ("exp(-position**2/2)*cos(pi*phase)", lambda p, v, q: np.exp(-(p**2) / 2) * np.cos(np.pi * q)),
-        ("sqrt(1 + position**2) + log(2 + velocity**2) + atan(phase) + sign(position)", None),
+        ("sqrt(1 + position**2) + sign(position)", lambda p, v, q: np.sqrt(1 + p**2) + np.sign(p)),
+        ("log(2 + velocity**2) + atan(phase)", lambda p, v, q: np.log(2 + v**2) + np.arctan(q)),
     ],
 )
 def test_evaluation_agrees_with_numpy(text, reference):
     p, v, q = np.random.default_rng(0).normal(size=(3, 50))
-    if reference is None:
-
-        def reference(p, v, q):
-            return np.sqrt(1 + p**2) + np.log(2 + v**2) + np.arctan(q) + np.sign(p)
-
     found = Formula(text, NAMES).evaluate({"position": p, "velocity": v, "phase": q})
     np.testing.assert_allclose(found, reference(p, v, q), rtol=1e-13, atol=1e-13)
 
@@ -74,11 +70,7 @@ def test_separation_rebuilds_the_lifting_for_any_phase():
     np.testing.assert_allclose(rebuilt, lifting.lift(x, {"phase": phase})[:, 2:], atol=1e-12)
 
 
-def test_bad_liftings_are_refused():
-    with pytest.raises(ConfigError, match="depends on no state"):
-        Lifting(("position",), ("3 + phase",), ("phase",))
-    with pytest.raises(ConfigError, match="repeat"):
-        Lifting(("position",), ("position**2", "position**2"))
+def test_values_that_do_not_fit_a_lifting_are_refused():
     with pytest.raises(DimensionError, match="parameter values for"):
         Lifting(("position",), ("sin(position + phase)",), ("phase",)).lift(np.zeros((2, 1)))
     with pytest.raises(DimensionError, match="expected 1 entries"):

@@ -7,6 +7,7 @@ import pytest
 import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sympy.core.evalf import PrecisionExhausted
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting
@@ -98,10 +99,9 @@ LEAVES = st.sampled_from(["x", "y", "q", "0.5", "2", "-1.25", "3"])
 
 
 def grow(inner):
+    functions = st.sampled_from(["sin", "cos", "tanh", "atan", "abs", "exp", "sign", "sqrt", "log", "tan"])
     return st.one_of(
-        st.tuples(
-            st.sampled_from(["sin", "cos", "tanh", "atan", "abs", "exp", "sign", "sqrt", "log", "tan"]), inner
-        ).map("{0[0]}({0[1]})".format),
+        st.tuples(functions, inner).map("{0[0]}({0[1]})".format),
         st.tuples(inner, st.sampled_from(["+", "-", "*", "/"]), inner).map("({0[0]} {0[1]} {0[2]})".format),
         st.tuples(inner, st.sampled_from(["2", "3", "-1", "-2", "0.5"])).map("({0[0]})**{0[1]}".format),
     )
@@ -133,9 +133,7 @@ def test_no_sample_escapes(text, middle, half):
             found = np.asarray(program.run(values)[0], dtype=float)
         lower, upper = bounds_of([expression], box)
         found = found[~np.isnan(found)]
-        slack = 1e-9 * np.maximum(
-            1, np.abs(np.where(np.isfinite(found), found, 1))
-        )  # log(0) is where it should be, too
+        slack = 1e-9 * np.maximum(1, np.abs(np.where(np.isfinite(found), found, 1)))  # log(0) is in its place, too
         assert np.all((found >= lower - slack) & (found <= upper + slack)), (text, expression)
 
 
@@ -163,10 +161,12 @@ def test_bounds_hold_in_exact_arithmetic(text, middle, half):
             lower, upper = bounds_of([tree], box)
         except ConfigError:
             continue
-        for corner in itertools.product(*box.values()):
-            exact = tree.subs(
-                {s: sp.Rational(dict(zip("xyq", corner, strict=True))[s.name]) for s in tree.free_symbols}
-            ).evalf(60)
+        for corner in set(itertools.product(*(box[symbol.name] for symbol in tree.free_symbols))):
+            values = zip(tree.free_symbols, map(sp.Rational, corner), strict=True)
+            try:
+                exact = tree.subs(dict(values)).evalf(60, maxn=200, strict=True)
+            except PrecisionExhausted:  # two hundred digits do not tell it from zero
+                continue
             if exact.is_real and exact.is_finite:
                 assert sp.Float(lower[0], 60) <= exact <= sp.Float(upper[0], 60), (text, tree, corner)
 

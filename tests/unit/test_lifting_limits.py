@@ -1,5 +1,4 @@
-"""Formulas that would take for ever, or are not finite, are refused before they do; slopes know where a function
-jumps."""
+"""Formulas without end, or that are not finite, are refused at once; slopes know where a function jumps."""
 
 import numpy as np
 import pytest
@@ -55,12 +54,8 @@ def test_what_is_no_text_is_refused(text):
 
 
 def test_numbers_are_those_of_double_precision():
-    for text, value in {
-        "9**20*x": 9.0**20,
-        "(1/3)**40*x": 3.0**-40,
-        "sqrt(2)*pi*x": np.sqrt(2) * np.pi,
-        "exp(exp(6))*x": np.exp(np.exp(6)),
-    }.items():
+    numbers = {"9**20*x": 9.0**20, "(1/3)**40*x": 3.0**-40, "exp(exp(6))*x": np.exp(np.exp(6))}
+    for text, value in numbers.items():
         assert float(Formula(text, ("x",)).evaluate({"x": 1.0})) == pytest.approx(value, rel=1e-14)
 
 
@@ -126,15 +121,7 @@ def test_slopes_between_any_two_points_are_within_the_bounds():
     """Difference quotients over the whole box, across what may be a jump."""
     rng = np.random.default_rng(0)
     away, whole = {"x": (0.5, 1.2), "y": (-1, 1)}, {"x": (-2, 2), "y": (-1, 1)}
-    smooth = [
-        "abs(x)",
-        "x/(1 + abs(x))",
-        "atan(tan(x/4))",
-        "1/(2 + cos(x))",
-        "x*abs(y)",
-        "sqrt(1 + x**2)",
-        "tan(sin(x))",
-    ]
+    smooth = ["abs(x)", "x/(1 + abs(x))", "atan(tan(x/4))", "1/(2 + cos(x))", "x*abs(y)", "tan(sin(x))"]
     for text in [*JUMPS, *smooth]:
         for box in (away, whole) if text in smooth else (away,):  # over the whole, jumps have no bounds
             lifting = Lifting(("x", "y"), (text,))

@@ -17,28 +17,15 @@ from kros.observer import Observer, Runtime
 from kros.observer.filter_bank import FilterBank
 from kros.synthesis.result import Injection
 
+DIAGONAL = np.diag([0.9, 0.8, 0.1])
 
-def observer(**changes: Any) -> Observer:
+
+def observer(A: Any = DIAGONAL) -> Observer:
     lifting = Lifting(("position", "velocity"), ("sin(3*position + phase)",), ("phase",))
     K = StateSpace(np.eye(2) / 2, np.ones((2, 1)), np.ones((3, 2)), np.ones((3, 1)), 0.01)
     runtime = Runtime(delay=1, lower=np.array([-1.0, -np.inf]), start=np.array([0.0, 0.5]))
-    parts: dict[str, Any] = {
-        "A": np.diag([0.9, 0.8, 0.1]),
-        "B": np.ones((3, 1)),
-        "measured": (0,),
-        "parameters": {"phase": 0.3},
-        **changes,
-    }
-    return Observer(
-        "o",
-        lifting,
-        inputs=("torque",),
-        controller=K,
-        injection=Injection.STATE,
-        sample_period_s=0.01,
-        runtime=runtime,
-        **parts,
-    )
+    model = A, np.ones((3, 1)), (0,), ("torque",)
+    return Observer("o", lifting, *model, K, Injection.STATE, 0.01, {"phase": 0.3}, runtime=runtime)
 
 
 def changed(path: Path, change: Callable[[dict[str, Any]], Any], checksum: bool = False) -> Path:
@@ -72,11 +59,8 @@ DEL = object()
 
 def test_what_was_saved_is_what_runs(tmp_path: Path) -> None:
     observer().save(str(tmp_path / "o.json"))
-    again, y, u = (
-        Observer.load(str(tmp_path / "o.json")),
-        np.random.default_rng(0).normal(size=(50, 1, 1)),
-        np.ones((50, 1, 1)),
-    )
+    again = Observer.load(str(tmp_path / "o.json"))
+    y, u = np.random.default_rng(0).normal(size=(50, 1, 1)), np.ones((50, 1, 1))
     np.testing.assert_array_equal(again.run(y, u), observer().run(y, u))
 
 

@@ -161,8 +161,9 @@ def test_bounds_hold_in_exact_arithmetic(text, middle, half):
             lower, upper = bounds_of([tree], box)
         except ConfigError:
             continue
-        for corner in set(itertools.product(*(box[symbol.name] for symbol in tree.free_symbols))):
-            values = zip(tree.free_symbols, map(sp.Rational, corner), strict=True)
+        symbols = list(tree.free_symbols)
+        for corner in set(itertools.product(*(box[symbol.name] for symbol in symbols))):
+            values = zip(symbols, map(sp.Rational, corner), strict=True)
             try:
                 exact = tree.subs(dict(values)).evalf(60, maxn=200, strict=True)
             except PrecisionExhausted:  # two hundred digits do not tell it from zero

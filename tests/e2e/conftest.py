@@ -89,6 +89,14 @@ def recorded(kros, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def pendulums(kros, tmp_path_factory) -> Path:
+    """Recordings of four pendulums."""
+    folder = tmp_path_factory.mktemp("pendulums") / "recordings"
+    assert kros("simulate", folder, "--plant", "pendulum", "--units", 4, "--episodes", 3, "--seconds", 5).exit_code == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
 def demo(kros, recorded, tmp_path_factory) -> Path:
     """A finished study, with fewer rows and points; `tests/e2e/test_report.py` draws all its figures."""
     folder = tmp_path_factory.mktemp("demo")

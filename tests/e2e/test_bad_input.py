@@ -35,20 +35,9 @@ def refused(kros, study, tmp_path, *words, code=2, options=()):
     assert "Traceback" not in result.stderr
 
 
-def first_csv(raw: Path) -> Path:
-    return sorted(raw.rglob("*.csv"))[0]
-
-
-def edit(path: Path, change) -> None:
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join(change(lines)) + "\n")
-
-
-def test_missing_folder(kros, study, tmp_path):
+def test_what_is_not_there(kros, study, tmp_path):
     refused(kros, study(source=tmp_path / "nowhere"), tmp_path, "nowhere")
-
-
-def test_missing_study(kros, tmp_path):
+    refused(kros, study(source="a\\u0000b"), tmp_path, "NUL")
     refused(kros, tmp_path / "no.toml", tmp_path, "no.toml")
 
 
@@ -73,6 +62,7 @@ def test_missing_study(kros, tmp_path):
         ("[sensor.position]\nnoise = 1e300", ("at most 1e+50", "found 1e+300")),
         ("[data.csv]\nfiles = 1\n[data.x]", ("data.x",)),
         ("not toml", ("TOML",)),
+        ("a = " + "[" * 5000, ("nested",)),
     ],
 )
 def test_bad_studies(kros, study, tmp_path, extra, words):
@@ -86,22 +76,23 @@ def test_a_function_that_is_not_finite_on_the_recordings(kros, study, tmp_path):
     assert "log(velocity) is not finite, or huge; use functions that are moderate on all recordings" in result.stderr
 
 
-def test_unknown_condition(kros, study, tmp_path):
-    path = study()
-    refused(kros, path, tmp_path, "hot", "noload", options=("--set", "data.identify_on=hot"))
-
-
-def test_bad_override_and_stage(kros, study, tmp_path):
-    path = study()
-    refused(kros, path, tmp_path, "KEY=VALUE", options=("--set", "identify.alpha"))
-    refused(kros, path, tmp_path, "--until", "quantify", options=("--until", "lunch"))
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--set", "data.identify_on=hot", ("hot", "noload")),
+        ("--set", "identify.alpha", ("KEY=VALUE",)),
+        ("--set", "identify.alpha=" + "[" * 5000, ("--set",)),
+        ("--set", "identify.alpha=" + "9" * 5000, ("--set",)),
+        ("--until", "lunch", ("--until", "quantify")),
+    ],
+)
+def test_bad_options(kros, study, tmp_path, option, value, words):
+    refused(kros, study(), tmp_path, *words, options=(option, value))
 
 
 def test_one_unit_only(kros, study, tmp_path, raw):
-    folders = sorted((raw / "batch_b" / "population").iterdir())
-    for folder in folders:
-        if "001002" in folder.name:
-            shutil.rmtree(folder)
+    for folder in (raw / "batch_b" / "population").glob("*001002*"):
+        shutil.rmtree(folder)
     path = study(source=raw, reader="motor-drive-raw")
     refused(kros, path, tmp_path, "001001")
     result = kros("run", path, "--out", tmp_path / "one", "--until", "identify")
@@ -124,15 +115,9 @@ def test_a_model_that_no_regularisation_was_allowed_to_stabilise(kros, study, tm
     refused(kros, study(), tmp_path, "spectral radius", "alpha", code=1, options=("--set", "identify.alpha=1e-9"))
 
 
-@pytest.mark.parametrize("command", ["check", "estimate", "report", "figures"])
-def test_commands_on_something_that_is_not_a_run(kros, tmp_path, command):
-    arguments = {
-        "check": [tmp_path],
-        "estimate": [tmp_path, tmp_path / "x.parquet"],
-        "report": [],
-        "figures": [tmp_path / "f"],
-    }[command]
-    result = kros(command, tmp_path, *arguments)
+@pytest.mark.parametrize(("command", "count"), [("check", 1), ("estimate", 2), ("report", 0), ("figures", 1)])
+def test_commands_on_something_that_is_not_a_run(kros, tmp_path, command, count):
+    result = kros(command, *[tmp_path, tmp_path, tmp_path / "x.parquet"][: 1 + count])
     assert result.exit_code == 2
     assert "study.json" in result.stderr
 
@@ -141,7 +126,9 @@ def test_bad_recordings_leave_an_earlier_run_as_it_was(kros, study, tmp_path, ra
     path, out = study(source=raw, reader="motor-drive-raw"), tmp_path / "run"
     assert kros("run", path, "--out", out, "--until", "calibrate").exit_code == 0
     before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
-    edit(first_csv(raw), lambda lines: lines[:2000] + lines[2010:])
+    first = sorted(raw.rglob("*.csv"))[0]
+    lines = first.read_text().splitlines(keepends=True)
+    first.write_text("".join(lines[:2000] + lines[2010:]))
     result = kros("run", path, "--out", out, "--until", "calibrate")
     assert result.exit_code == 2
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before

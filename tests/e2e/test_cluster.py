@@ -184,14 +184,6 @@ def alone(_: int, folder: Path) -> bool:
     return True
 
 
-def die_once(x: int, folder: Path) -> int:
-    died = folder / "died"
-    if x == 3 and not died.exists():
-        died.touch()
-        os._exit(9)
-    return x
-
-
 def die(_: int) -> None:
     os._exit(9)
 
@@ -220,12 +212,6 @@ def test_workers_have_the_same_kros(cluster, monkeypatch):
         pytest.raises(KrosError, match="install the same version on every worker"),
     ):
         list(executor(square, [0]))
-
-
-def test_a_task_whose_worker_ends_runs_again_on_another(cluster, tmp_path):
-    with open_executor(scheduler=cluster.start(2)) as executor:
-        assert list(executor(partial(die_once, folder=tmp_path), range(6))) == list(range(6))
-    assert (tmp_path / "died").exists()
 
 
 def test_a_study_with_a_worker_killed_half_way_leaves_the_same_bytes(cluster, study, wanted, tmp_path, monkeypatch):

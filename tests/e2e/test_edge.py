@@ -8,41 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-
-from kros.data import Channel, Role, from_arrays, write_parquet
-
-CHANNELS = (
-    Channel("position", Role.STATE, "rad", measured=True),
-    Channel("velocity", Role.STATE, "rad/s"),
-    Channel("torque", Role.INPUT),
-)
-
-
-def motion(seed: int, n: int = 400) -> np.ndarray:
-    """A damped oscillator on noise, shape (n, 3), 0.01 s apart."""
-    rng = np.random.default_rng(seed)
-    u, x = np.repeat(rng.normal(size=n // 10), 10), np.zeros((n, 2))
-    for k in range(n - 1):
-        x[k + 1] = [[1.0, 0.01], [-0.05, 0.95]] @ x[k] + [0.0, 0.1 * u[k]]
-    return np.column_stack([x + 1e-4 * rng.normal(size=(n, 2)), u])
-
-
-def episodes() -> dict:
-    return {unit: [motion(10 * i + k) for k in range(3)] for i, unit in enumerate("abc")}
-
-
-@pytest.fixture
-def store(tmp_path):
-    """Write recordings and a study on them."""
-
-    def write(data=None, period=0.01, extra="") -> Path:
-        write_parquet(from_arrays(data or episodes(), CHANNELS, period), tmp_path / "recordings")
-        (tmp_path / "study.toml").write_text(f'[data]\nsource = "recordings"\nreader = "parquet"\n{extra}\n')
-        return tmp_path / "study.toml"
-
-    return write
 
 
 def said(result, code, *words):
@@ -100,15 +66,14 @@ def test_an_exception_of_any_command_becomes_one_message(kros, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("out", ["x" * 300, "file/inside", "locked/inside"])
-def test_folders_that_cannot_be_made(kros, store, tmp_path, out):
-    study = store()
+def test_folders_that_cannot_be_made(kros, study, tmp_path, out):
     (tmp_path / "file").write_text("")
     (tmp_path / "locked").mkdir()
     if out.startswith("locked"):
         if os.geteuid() == 0:
             pytest.skip("nothing is forbidden to root")
         (tmp_path / "locked").chmod(0o500)
-    result = kros("run", study, "--out", tmp_path / out, "--until", "read")
+    result = kros("run", study(), "--out", tmp_path / out, "--until", "read")
     assert result.exit_code in (1, 2)
     said(result, result.exit_code)
 
@@ -133,32 +98,6 @@ def test_an_output_that_is_full_or_gone():
     os.close(writer)
     assert done.returncode == 1
     assert done.stderr == ""
-
-
-@pytest.mark.parametrize(
-    ("content", "word"),
-    [("a = " + "[" * 5000, "nested"), ('[data]\nsource = "a\\u0000b"\n', "NUL"), ("data = 5\n", "data")],
-    ids=range(3),
-)
-def test_studies_that_cannot_be_used(kros, store, tmp_path, content, word):
-    study = store()
-    study.write_text(content)
-    said(kros("run", study, "--out", tmp_path / "out"), 2, word)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("value", ["[" * 5000, "9" * 5000])
-def test_values_on_the_command_line(kros, store, tmp_path, value):
-    result = kros("run", store(), "--out", tmp_path / "out", "--set", f"identify.alpha={value}")
-    said(result, 2, "--set")
-
-
-@pytest.mark.parametrize("period", [1e-7, 1.0, 3600.0])
-def test_no_sampling_period_is_doubted(kros, store, tmp_path, period):
-    out = tmp_path / "out"
-    result = kros("run", store(period=period), "--out", out, "--until", "read")
-    assert result.exit_code == 0, result.output
-    assert json.loads((out / "metrics.json").read_text())["study"].get("alerts", []) == []
 
 
 def test_runs_of_another_version_and_damaged_ones(kros, demo, recorded, tmp_path):

@@ -76,28 +76,20 @@ def fresh(source: Path, tmp_path: Path, **identify: Any) -> dict[str, Any]:
     return results(study(source, tmp_path / "fresh", **identify))
 
 
-def test_a_unit_that_is_new_is_the_only_one_that_is_computed(drives, tmp_path, computed):
-    last = [p for p in folders(drives) if "_001003_" in p.name]
-    assert len(last) == 2
+@pytest.mark.parametrize(
+    ("new", "read", "load"),
+    [("*_001003_*", ["001003"] * 2, ["001003"]), ("*_001002_noload/*2.csv", ["001002"], [])],
+    ids=["a unit", "an episode"],
+)
+def test_of_what_is_new_its_unit_alone_is_computed(drives, tmp_path, computed, new, read, load):
+    last = list(drives.glob(f"batch_b/population/{new}"))
+    assert len(last) == len(read)
     source = without(drives, tmp_path / "raw", *last)
     run = study(source, tmp_path / "run")
     put_back(drives, source)
     computed.clear()
     study(source, run)
-    once = ("calibrate", "identify (noload)", "identify (load)")
-    assert computed == {"read": ["001003"] * 2, **{title: ["001003"] for title in once}}
-    assert results(run) == fresh(source, tmp_path)
-
-
-def test_an_episode_that_is_new_changes_its_unit_alone(drives, tmp_path, computed):
-    (folder,) = (p for p in folders(drives) if p.name.endswith("_001002_noload"))
-    source = without(drives, tmp_path / "raw", sorted(folder.iterdir())[-1])
-    run = study(source, tmp_path / "run")
-    put_back(drives, source)
-    computed.clear()
-    study(source, run)
-    once = ("read", "calibrate", "identify (noload)")
-    assert computed == {**{title: ["001002"] for title in once}, "identify (load)": []}
+    assert computed == {"read": read, "calibrate": read[:1], "identify (noload)": read[:1], "identify (load)": load}
     assert results(run) == fresh(source, tmp_path)
 
 

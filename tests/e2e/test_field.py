@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from csvs import write_csvs
 
 from kros.data import Channel, Population, Role, from_arrays, write_parquet
-from kros.plants import PLANTS
+from kros.plants import HarmonicDrivePopulation
 from kros.report.manifest import describe, read_manifest, write_manifest
 
 SEEN = ("position", "target_position", "target_velocity")
@@ -36,15 +37,8 @@ channel = [
 @pytest.fixture(scope="module")
 def machines() -> Population:
     """Two drives that the study never saw, and a badly assembled one."""
-    settings: dict[str, Any] = {
-        "n_units": 2,
-        "n_episodes": 2,
-        "seconds": 5.0,
-        "seed": 79,
-        "conditions": ("noload",),
-        "outlier": True,
-    }
-    return PLANTS["harmonic-drive"](**settings).simulate().population
+    settings: dict[str, Any] = {"n_units": 2, "n_episodes": 2, "seconds": 5.0, "seed": 79, "outlier": True}
+    return HarmonicDrivePopulation(**settings, conditions=("noload",)).simulate().population
 
 
 @pytest.fixture
@@ -52,13 +46,9 @@ def field(machines: Population, tmp_path: Path) -> Callable[..., Path]:
     """Write what a logger in the field records, perhaps changed; returns DATA."""
 
     def write(change: Callable[[np.ndarray], np.ndarray] = np.asarray, unit: str = "rad") -> Path:
-        columns = [[c.name for c in machines.channels].index(name) for name in SEEN]
-        (tmp_path / "logged").mkdir()
-        for key in machines.episodes:
-            values = change(machines.read(key)[:, columns])
-            rows = np.column_stack([1e-3 * np.arange(len(values)), values])
-            path = tmp_path / "logged" / f"m{key.unit}_{key.condition}_{key.episode}.csv"
-            np.savetxt(path, rows, delimiter=",", header=",".join(["t", *SEEN]), comments="", fmt="%.17g")
+        columns, name = [0, 3, 4], "m{key.unit}_{key.condition}_{key.episode}.csv"
+        header = ",".join(["t", *SEEN])
+        write_csvs(tmp_path / "logged", machines, name, header, lambda values, _: change(values[:, columns]))
         (tmp_path / "field.toml").write_text(TOML.format(source="logged", unit=unit))
         return tmp_path / "field.toml"
 
@@ -150,8 +140,7 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
 ) -> None:
     result = kros("estimate", lifted, field(), tmp_path / "whole.csv")
     calibrated = json.loads((tmp_path / "whole.csv-metadata.json").read_text())["parameters"]
-    for file in (tmp_path / "logged").iterdir():
-        np.savetxt(file, _cut(file), delimiter=",", header=",".join(["t", *SEEN]), comments="", fmt="%.17g")
+    field(one_direction)
     result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "x.csv")
     assert result.exit_code == 1
     assert "--track phase" in result.stderr
@@ -168,11 +157,6 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
         apart = np.angle(np.exp(1j * (facts["parameters"][unit]["phase"] - calibrated[unit]["phase"])))
         assert abs(apart) < 0.6  # motion in one direction cannot tell a phase from a lag
     assert np.isfinite(values).all()
-
-
-def _cut(file: Path) -> np.ndarray:
-    values = one_direction(np.loadtxt(file, delimiter=",", skiprows=1)[:, 1:])
-    return np.column_stack([1e-3 * np.arange(len(values)), values])
 
 
 def test_missing_samples_are_taken_and_counted(kros, demo, field, tmp_path) -> None:
@@ -220,19 +204,15 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
     for row in rows.values():
         assert row["score"] is None
         assert row["missing"] == ["velocity", "current"]
-        assert (row["status"], row["outlier"], row["level_units"]) == (
-            "cannot tell",
-            False,
-            5,
-        )  # too few units for a verdict
+        stated = row["status"], row["outlier"], row["level_units"]
+        assert stated == ("cannot tell", False, 5)  # too few units for a verdict
     bad, *good = (row["level_db"] for row in rows.values())
     assert bad > max(0.0, max(good) + 1.0)
     assert result.exit_code == 4
     lines = kros("check", demo, data).stdout.splitlines()
     assert [line.split() for line in lines[::2]] == [["UNDECIDED", unit] for unit in rows]
-    assert all(
-        "without velocity, current" in line and "the monitor's bound, from 5 units" in line for line in lines[1::2]
-    )
+    assert all("without velocity, current" in line for line in lines[1::2])
+    assert all("the monitor's bound, from 5 units" in line for line in lines[1::2])
 
 
 @pytest.mark.parametrize(("gain", "code", "word"), [(-1e-4, 0, "SAFE"), (-1e3, 3, "NOT SAFE")])

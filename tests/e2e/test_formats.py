@@ -142,18 +142,11 @@ WRITERS: dict[str, Callable[[Path, Array, dict[str, Array]], None]] = {
     ".mcap": bag,
     ".db3": bag,
 }
-PACKAGES = {
-    ".parquet": "pandas",
-    ".feather": "pyarrow",
-    ".mat73": "h5py",
-    ".h5": "h5py",
-    ".mf4": "asammdf",
-    ".tdms": "nptdms",
-}
+PACKAGES = {".parquet": "pandas", ".mat73": "h5py", ".h5": "h5py", ".mf4": "asammdf", ".tdms": "nptdms"}
 
 
 def written(folder: Path, motors, ending: str, count: int | None = None) -> Path:
-    pytest.importorskip(PACKAGES.get(ending, "scipy" if ending == ".mat" else "rosbags"))
+    pytest.importorskip("rosbags" if WRITERS[ending] is bag else PACKAGES.get(ending, "pyarrow"))
     folder.mkdir()
     for key in motors.episodes[:count]:
         values = motors.read(key)
@@ -238,10 +231,8 @@ def test_columns_that_say_unit_and_episode_are_found(kros, tmp_path, motors, end
         frames.setdefault(key.unit if several else "all", []).append(frame)
     folder.mkdir()
     for name, parts in frames.items():
-        table = pd.concat(parts, ignore_index=True)
-        table.to_csv(folder / f"motor{name}.csv", index=False) if ending == "csv" else table.to_parquet(
-            folder / f"motor{name}.parquet"
-        )
+        table, path = pd.concat(parts, ignore_index=True), folder / f"motor{name}.{ending}"
+        table.to_csv(path, index=False) if ending == "csv" else table.to_parquet(path)
     result = kros("init", folder, "--out", study)
     assert result.exit_code == 0, result.output
     found = open_source(load_config(study))
@@ -249,7 +240,5 @@ def test_columns_that_say_unit_and_episode_are_found(kros, tmp_path, motors, end
     assert [c.name for c in found.channels] == list(NAMES)
     np.testing.assert_allclose(found.read(found.episodes[0]), motors.read(motors.episodes[0]), atol=1e-12)
     assert several or found.unit_ids == tuple(f"SN-{unit}" for unit in motors.unit_ids)
-    assert (
-        kros("run", study, "--out", tmp_path / "run", "--until", "identify", "--set", "identify.refine=false").exit_code
-        == 0
-    )
+    options = ("--until", "identify", "--set", "identify.refine=false")
+    assert kros("run", study, "--out", tmp_path / "run", *options).exit_code == 0

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from csvs import write_csvs
 
 from kros.data import EpisodeKey, Population
 from kros.plants import DcMotorPopulation
@@ -58,10 +59,8 @@ def tabs(path: Path, values: Array, period_s: float) -> None:
 def plain(path: Path, values: Array, period_s: float) -> None:
     """Commas and points, lines that end with CR; a counter, a column that rests, a note."""
     lines = ["index,time_us,position,velocity,current,voltage,spare,note"]
-    lines += [
-        f"{k},{1e6 * k * period_s:.6g},{','.join(f'{x:.12g}' for x in r)},0.5,fine"
-        for k, r in enumerate(values.tolist())
-    ]
+    rows = (",".join(f"{x:.12g}" for x in row) for row in values.tolist())
+    lines += [f"{k},{1e6 * k * period_s:.6g},{row},0.5,fine" for k, row in enumerate(rows)]
     path.write_bytes(("\r".join(lines) + "\r").encode())
 
 
@@ -77,9 +76,7 @@ def written(folder: Path, population: Population, kind: str) -> Path:
     """Write all episodes as a stranger would."""
     write, name = WRITERS[kind]
     for key in population.episodes:
-        path = folder / name.format(
-            unit=int(key.unit.lstrip("abcdefghijklmnopqrstuvwxyz-_")), episode=int(key.episode) + 1
-        )
+        path = folder / name.format(unit=int(key.unit), episode=int(key.episode) + 1)
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path, population.read(key), population.sample_period_s)
     return folder
@@ -104,10 +101,8 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
     units = sorted(p.name for p in folder.iterdir())
     shutil.copy(folder / units[0] / "2024-05-01.csv", folder / units[1] / "2024-05-01.csv")
     stuck = folder / units[2] / "2024-05-02.csv"
-    lines = stuck.read_text().splitlines()
-    stuck.write_text(
-        "\n".join([lines[0], *(",".join([*(c := line.split(","))[:4], "1.5", *c[5:]]) for line in lines[1:])])
-    )
+    head, *lines = (line.split(",") for line in stuck.read_text().splitlines())
+    stuck.write_text("\n".join(map(",".join, [head, *([*row[:4], "1.5", *row[5:]] for row in lines)])))
     gap = folder / units[3] / "2024-05-03.csv"
     lines = gap.read_text().splitlines()
     gap.write_text("\n".join(lines[:500] + lines[600:]))
@@ -123,10 +118,7 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
         assert part in result.output
     found = open_source(load_config(study))
     assert len(found.episodes) == 10
-    assert (
-        EpisodeKey(units[0], "default", "01") not in found.episodes
-        or EpisodeKey(units[1], "default", "01") not in found.episodes
-    )
+    assert not {EpisodeKey(unit, "default", "01") for unit in units[:2]} <= set(found.episodes)
     assert kros("run", study, "--out", tmp_path / "run", "--until", "read").exit_code == 0
     for change, message in (
         ("time_scale=nan", "data.csv.time_scale: input should be a finite number, found nan"),
@@ -138,11 +130,8 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
 
 
 def test_roles_are_taken_from_options(kros, tmp_path, motors):
-    folder, study = tmp_path / "recordings", tmp_path / "study.toml"
-    folder.mkdir()
-    form = {"delimiter": ",", "header": "aa,bb,cc,dd", "comments": "", "fmt": "%.10g"}
-    for key in motors.episodes[:6]:
-        np.savetxt(folder / f"{key.unit}_{key.episode}.csv", motors.read(key), **form)
+    folder = write_csvs(tmp_path / "recordings", motors, "{key.unit}_{key.episode}.csv", "aa,bb,cc,dd", count=6)
+    study = tmp_path / "study.toml"
 
     def refused(words: str, *options: object) -> None:
         result = kros("init", folder, "--out", study, *options)
@@ -166,14 +155,8 @@ def test_roles_are_taken_from_options(kros, tmp_path, motors):
 
 
 def test_columns_of_one_name_are_told_apart_and_reserved_names_are_not_taken(kros, tmp_path, motors):
-    def folder(name: str, header: str):
-        form = {"delimiter": ",", "header": header, "comments": "", "fmt": "%.12g"}
-        for key in motors.episodes[:6]:
-            path = tmp_path / name / key.unit / f"run_{key.episode}.csv"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            values = motors.read(key)
-            np.savetxt(path, np.column_stack([motors.sample_period_s * np.arange(len(values)), values]), **form)
-        return tmp_path / name
+    def folder(name: str, header: str) -> Path:
+        return write_csvs(tmp_path / name, motors, "{key.unit}/run_{key.episode}.csv", header, count=6)
 
     doubled, key = folder("doubled", "time,position,velocity,velocity,u"), motors.episodes[0]
     named = kros("init", doubled, "--out", tmp_path / "none.toml", "--measured", "time")
@@ -188,22 +171,15 @@ def test_columns_of_one_name_are_told_apart_and_reserved_names_are_not_taken(kro
 
 
 def test_single_samples_without_a_value_cost_no_episode(kros, tmp_path, motors):
-    recordings = tmp_path / "recordings"
-    recordings.mkdir()
-    for i, key in enumerate(motors.episodes):
-        values = motors.read(key)
-        table = np.column_stack([motors.sample_period_s * np.arange(len(values)), values])
-        table[100 + i, 2] = np.nan
-        if i == 0:
-            table[:, 3] = np.nan  # nothing to bridge: the episode cannot be used
-        np.savetxt(
-            recordings / f"{key.unit}_{key.episode}.csv",
-            table,
-            "%.9g",
-            ",",
-            header="time,position,velocity,current,voltage",
-            comments="",
-        )
+    def with_gap(values: Array, number: int) -> Array:
+        table = values.copy()
+        table[100 + number, 1] = np.nan
+        if number == 0:
+            table[:, 2] = np.nan  # nothing to bridge: the episode cannot be used
+        return table
+
+    header = "time,position,velocity,current,voltage"
+    recordings = write_csvs(tmp_path / "recordings", motors, "{key.unit}_{key.episode}.csv", header, with_gap)
     result = kros("init", recordings, "--out", tmp_path / "study.toml")
     assert result.exit_code == 0, result.output
     assert f"NaN in {len(motors.episodes) - 1} episodes is bridged by straight lines" in result.output

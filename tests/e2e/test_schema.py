@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
+from csvs import write_csvs
 
 from kros.plants import DcMotorPopulation
 
@@ -23,13 +24,9 @@ def study(kros, tmp_path_factory) -> Path:
     """A study that `kros init` wrote, with its schema."""
     folder = tmp_path_factory.mktemp("schema")
     motors = DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.2, seed=1).simulate().population
-    (folder / "recordings").mkdir()
-    for key in motors.episodes:
-        columns = {c.name: motors.read(key)[:, i].tolist() for i, c in enumerate(motors.channels)}
-        rows = zip(*columns.values(), strict=True)
-        lines = [f"t,{','.join(columns)}", *(f"{k / 500},{','.join(map(str, row))}" for k, row in enumerate(rows))]
-        (folder / "recordings" / f"motor{key.unit}_run{key.episode}.csv").write_text("\n".join(lines))
-    result = kros("init", folder / "recordings", "--out", folder / "study.toml")
+    header = ",".join(["t", *(c.name for c in motors.channels)])
+    recordings = write_csvs(folder / "recordings", motors, "motor{key.unit}_run{key.episode}.csv", header)
+    result = kros("init", recordings, "--out", folder / "study.toml")
     assert result.exit_code == 0, result.output
     return folder / "study.toml"
 

@@ -1,16 +1,9 @@
-"""The demo command, alone: it simulates, runs the whole study, says where the report is, goes on where it was, and draws again what it found."""
+"""The demo command, alone: it simulates, runs the whole study, says where the report is, and goes on where it was."""
 
 import json
 import re
 
-import pytest
-
-FAST = (
-    "identify.refine=false",
-    "uncertainty.n_freqs=60",
-    'synthesis.methods=["residual_h2"]',
-    'observer.baselines=["open_loop"]',
-)
+FAST = ("identify.refine=false", "uncertainty.n_freqs=60", "synthesis.methods=[]", 'observer.baselines=["open_loop"]')
 
 
 def test_the_demo_command_runs_everything_and_says_where_the_report_is(kros, few_figures, low_order_weights, tmp_path):
@@ -28,8 +21,3 @@ def test_the_demo_command_runs_everything_and_says_where_the_report_is(kros, few
     assert again.stderr.count("unchanged") == len(metrics["timing_s"]) - 1
     assert (out / "notes.txt").read_text() == "remember"
     assert json.loads((out / "metrics.json").read_text()) == metrics
-    page = (out / "report.html").read_bytes()
-    assert kros("report", out).exit_code == 0
-    assert len((out / "report.html").read_bytes()) == pytest.approx(len(page), rel=0.02)
-    assert kros("figures", out, tmp_path / "figures").exit_code == 0
-    assert len(list((tmp_path / "figures").glob("*.png"))) == len(list((tmp_path / "figures").glob("*.pdf"))) == 2

@@ -11,7 +11,7 @@ from kros.uncertainty import quantify, residual
 from kros.uncertainty.forms import completion
 from kros.uncertainty.weights.proof import ProofMethod
 
-UNITS, DT = 210, 0.01
+UNITS, DT = 120, 0.01
 
 
 def fleet(n_units: int = UNITS, outputs: int = 2, seed: int = 0) -> StateSpace:

@@ -1,4 +1,4 @@
-"""Where weights are checked, and what degenerate magnitudes give: cases worked out by hand."""
+"""Frequency grids, where weights are checked, and what degenerate magnitudes give: cases worked out by hand."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from residuals import of_systems
 
-from kros.core import KrosError, StateSpace
-from kros.core.frequency import log_grid
+from kros.core import ConfigError, KrosError, StateSpace
+from kros.core.frequency import log_grid, nyquist_hz
 from kros.uncertainty import quantify
+from kros.uncertainty.forms import check_grid
 from kros.uncertainty.weights.fit import checking_grid
 from kros.uncertainty.weights.magnitude import RationalMagnitude
 
@@ -44,14 +45,8 @@ def test_zeros_of_what_is_inverted_are_peaks(form: str) -> None:
 
 
 def test_a_magnitude_that_is_infinite_or_zero_at_an_end_has_no_spectral_factor() -> None:
-    knots = np.array([0.1, 1.0])
-    for n, d in (
-        ([1, 1, 1], [1, 1, 0]),
-        ([1, 1, 0], [1, 1, 1]),
-        ([1, 1, 1], [0, 1, 1]),
-        ([0, 0, 0], [1, 1, 1]),
-        ([1, 1, 1], [1, 1, np.nan]),
-    ):
+    knots, ones = np.array([0.1, 1.0]), [1, 1, 1]
+    for n, d in ((ones, [1, 1, 0]), ([1, 1, 0], ones), (ones, [0, 1, 1]), ([0, 0, 0], ones), (ones, [1, 1, np.nan])):
         with pytest.raises(KrosError):
             RationalMagnitude(np.array(n, float), np.array(d, float), knots).factor()
 
@@ -59,6 +54,19 @@ def test_a_magnitude_that_is_infinite_or_zero_at_an_end_has_no_spectral_factor()
 def test_a_pole_on_the_unit_circle_in_double_precision_is_refused() -> None:
     with pytest.raises(KrosError, match="unit circle"):
         RationalMagnitude(np.array([1.0, 1.0]), np.array([1.0, 1e-32]), np.array([1.0])).factor()
+
+
+def test_default_grid_spans_six_decades_up_to_nyquist() -> None:
+    grid = log_grid(1e-3)
+    assert len(grid) == 1000
+    assert grid[-1] == 500.0 == nyquist_hz(1e-3)
+    np.testing.assert_allclose(np.diff(np.log(grid)), np.log(10) * 6 / 999)
+
+
+@pytest.mark.parametrize("bad", [[2.0, 1.0], [-1.0, 1.0], [1.0, 501.0], [np.nan], [], [[1.0]]])
+def test_bad_grids_are_refused(bad: list[float]) -> None:
+    with pytest.raises(ConfigError, match="grid"):
+        check_grid(bad, 1e-3)
 
 
 def test_a_grid_does_not_begin_below_what_the_longest_recording_resolves() -> None:

@@ -1,4 +1,4 @@
-"""The head of the report: verdict, reasons, numbers, certificates; for metrics made by hand."""
+"""The head of the report: verdict, reasons, numbers, certificates, and what differs between runs; for metrics made by hand."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from kros.report.content import Column, build
+from kros.report.compare import compared, differences
 from kros.report.facts import Facts
 from kros.report.sections.errors import errors
 from kros.report.verdict import Status, judge
@@ -25,89 +24,60 @@ def row(observer: str, percent: float | None, unit: str = "b", channel: str = "v
 
 
 def metrics(**parts: Any) -> dict[str, Any]:
-    study = {
-        "units": 3,
-        "conditions": ["default"],
-        "identify_on": "default",
-        "sample_period_s": 0.002,
-        "deployed": NAME,
-        "measured": ["angle"],
-        "channels": {"angle": "rad", "velocity": "rad/s"},
-    }
-    observers = {
-        NAME: {"status": "certified", "relift_certified": True, "relift_gain": 2.0},
-        "linear/worst_case_h2": {"status": "certified"},
-    }
+    study = {"units": 3, "conditions": ["default"], "identify_on": "default", "sample_period_s": 0.002}
+    study |= {"deployed": NAME, "measured": ["angle"], "channels": {"angle": "rad", "velocity": "rad/s"}}
+    certified = {"status": "certified", "relift_certified": True, "relift_gain": 2.0}
+    observers = {NAME: certified, "linear/worst_case_h2": {"status": "certified"}}
     study |= parts.pop("study", {})
     evaluation = [row(NAME, 0.2), row("koopman/open_loop", 0.9)]
     return {"study": study, "observers": observers, "evaluation": evaluation, **parts}
 
 
+OPEN_LOOP = "koopman/open_loop"
 BETTER_IN_ONE = [
-    (NAME, 0.2, "velocity"),
-    (NAME, 6.2, "current"),
-    ("koopman/open_loop", 0.9, "velocity"),
-    ("koopman/open_loop", 6.1, "current"),
+    row(NAME, 0.2),
+    row(OPEN_LOOP, 0.9),
+    row(NAME, 6.2, "b", "current"),
+    row(OPEN_LOOP, 6.1, "b", "current"),
 ]
+RIVAL = [row(NAME, 0.2), row("linear/residual_h2", 0.1)]
+LOSSES = {NAME: {"loss_error_percent": 38.0}, "linear/residual_h2": {"loss_error_percent": None}}
+UNCERTIFIED = {NAME: {"relift_certified": False}, "linear/mixed": {}}
 FLAGGED = {"unit": "b", "condition": "default", "score": 9.0, "outlier": True}
 OPEN = {**FLAGGED, "outlier": False, "status": "cannot tell"}
 BOUND = {"set_certified": True, "set_bound": {"velocity": 0.003}, "relift_certified": True, "relift_gain": 2.0}
 
 
+CHECK: list[tuple[dict[str, Any], str, str]] = [
+    ({"outliers": [FLAGGED]}, "units", "Flagged as not belonging to the batch: b"),
+    ({"outliers": [OPEN]}, "units", "No outlier score is conclusive (1 of 1)"),
+    ({"study": {"alerts": ["a stuck sensor"]}}, "recordings", "a stuck sensor"),
+    ({"observers": UNCERTIFIED}, "certificates", "No certificate at run time"),
+    ({"observers": {NAME: BOUND}}, "certificates", "0.00400 rad/s, expected were 0.00300 rad/s"),
+    ({"evaluation": [row(NAME, 0.2), row("linear/mixed", 0.1)]}, "errors", "“linear, mixed H2-H∞” has smaller errors"),
+    (
+        {"evaluation": RIVAL, "observers": LOSSES},
+        "errors",
+        "but where measurements are lost it diverges (the deployed one: 38",
+    ),
+    ({"evaluation": BETTER_IN_ONE}, "errors", "The correction does not improve current"),
+    ({"observers": {"learned": {}}}, "certificates", "No robust observer"),
+]
+NOT_READY: list[tuple[dict[str, Any], str, str]] = [
+    ({"evaluation": [row(OPEN_LOOP, 0.9)], "study": {"deployed": OPEN_LOOP}}, "errors", "no better than its model"),
+    ({"evaluation": [row(NAME, None)]}, "models", "diverge"),
+    ({"evaluation": [row(NAME, 0.9), row(OPEN_LOOP, 0.9)]}, "errors", "no better than its model"),
+    ({"left_out": {"rows": [row(NAME, None)], "failed": {}}}, "left-out", "diverges on some"),
+    ({"study": {"deployed": None}}, "run", "stopped before an observer was designed"),
+]
+
+
 @pytest.mark.parametrize(
-    ("parts", "status", "section", "text"),
-    [
-        ({"outliers": [FLAGGED]}, Status.CHECK, "units", "Flagged as not belonging to the batch: b"),
-        ({"outliers": [OPEN]}, Status.CHECK, "units", "No outlier score is conclusive (1 of 1)"),
-        ({"study": {"alerts": ["a stuck sensor"]}}, Status.CHECK, "recordings", "a stuck sensor"),
-        (
-            {"observers": {NAME: {"relift_certified": False}, "linear/mixed": {}}},
-            Status.CHECK,
-            "certificates",
-            "No certificate at run time",
-        ),
-        ({"observers": {NAME: BOUND}}, Status.CHECK, "certificates", "0.00400 rad/s, expected were 0.00300 rad/s"),
-        (
-            {"evaluation": [row(NAME, 0.2), row("linear/mixed", 0.1)]},
-            Status.CHECK,
-            "errors",
-            "“linear, mixed H2-H∞” has smaller errors",
-        ),
-        (
-            {
-                "evaluation": [row(NAME, 0.2), row("linear/residual_h2", 0.1)],
-                "observers": {NAME: {"loss_error_percent": 38.0}, "linear/residual_h2": {"loss_error_percent": None}},
-            },
-            Status.CHECK,
-            "errors",
-            "smaller errors in all hidden channels, but where measurements are lost it diverges (the deployed one: 38",
-        ),
-        (
-            {"evaluation": [row("koopman/open_loop", 0.9)], "study": {"deployed": "koopman/open_loop"}},
-            Status.NOT_READY,
-            "errors",
-            "no better than its model",
-        ),
-        ({"evaluation": [row(NAME, None)]}, Status.NOT_READY, "models", "diverge"),
-        (
-            {"evaluation": [row(NAME, 0.9), row("koopman/open_loop", 0.9)]},
-            Status.NOT_READY,
-            "errors",
-            "no better than its model",
-        ),
-        (
-            {"evaluation": [row(o, e, channel=c) for o, e, c in BETTER_IN_ONE]},
-            Status.CHECK,
-            "errors",
-            "The correction does not improve current",
-        ),
-        ({"observers": {"learned": {}}}, Status.CHECK, "certificates", "No robust observer"),
-        ({"left_out": {"rows": [row(NAME, None)], "failed": {}}}, Status.NOT_READY, "left-out", "diverges on some"),
-        ({"study": {"deployed": None}}, Status.NOT_READY, "run", "stopped before an observer was designed"),
-    ],
+    ("status", "parts", "section", "text"),
+    [(Status.CHECK, *case) for case in CHECK] + [(Status.NOT_READY, *case) for case in NOT_READY],
 )
 def test_every_reason_sets_the_status_and_leads_to_its_section(
-    parts: dict[str, Any], status: Status, section: str, text: str
+    status: Status, parts: dict[str, Any], section: str, text: str
 ) -> None:
     found = judge(Facts(metrics(**parts)))
     assert found.status is status
@@ -132,23 +102,12 @@ def test_a_unit_with_several_times_the_error_of_the_others_is_named_with_its_err
 
 
 def test_a_rival_that_is_better_in_one_hidden_state_is_named_with_the_state() -> None:
-    means = {
-        NAME: (16.0, 8.0),
-        "learned": (12.0, 10.6),
-        "filtered_difference": (12.3, None),
-        "linear/mixed": (20.0, 7.0),
-    }
-    rows = [
-        row(name, percent, channel=channel)
-        for name, of in means.items()
-        for channel, percent in zip(("velocity", "force"), of, strict=True)
-        if percent
-    ]
+    means = {NAME: (16.0, 8.0), "learned": (12.0, 10.6), "linear/mixed": (20.0, 7.0)}
+    rows = [row(name, velocity) for name, (velocity, _) in means.items()] + [row("filtered_difference", 12.3)]
+    rows += [row(name, force, channel="force") for name, (_, force) in means.items()]
     texts = [r.text for r in judge(Facts(metrics(evaluation=rows))).reasons if "smaller errors" in r.text]
-    assert texts == [
-        "“learned” has smaller errors of velocity.",
-        "“linear, mixed H2-H∞” has smaller errors of force.",
-    ]
+    better = {"learned": "velocity", "linear, mixed H2-H∞": "force"}
+    assert texts == [f"“{name}” has smaller errors of {state}." for name, state in better.items()]
 
 
 def test_a_bound_that_a_unit_exceeds_says_so_where_it_stands() -> None:
@@ -184,11 +143,7 @@ def test_errors_against_the_true_signal_stand_beside_those_against_the_recording
 
 
 def test_the_best_certified_observer_is_one_that_was_designed() -> None:
-    entries = {
-        "l/open_loop": {"worst_case_h2": 1.0},
-        "l/mixed": {"worst_case_h2": 1.0},
-        "l/worst_case_h2": {"worst_case_h2": 1.0},
-    }
+    entries = {f"l/{method}": {"worst_case_h2": 1.0} for method in ("open_loop", "mixed", "worst_case_h2")}
     rows = [row("l/open_loop", 0.1), row("l/mixed", 0.5), row("l/worst_case_h2", 0.4), row(NAME, 0.2)]
     first = errors(Facts(metrics(observers={**entries, NAME: {}}, evaluation=rows))).tables[0]
     notes = {cells[0].text: cells[0].note for cells in first.rows}
@@ -196,32 +151,6 @@ def test_the_best_certified_observer_is_one_that_was_designed() -> None:
     signals = {**metrics()["observers"], NAME: {"set_certified": True}}
     first = errors(Facts(metrics(observers=signals, evaluation=rows))).tables[0]
     assert first.rows[first.chosen[0]][0].note.startswith("deployed and best with a certificate")
-
-
-def test_tables_leave_out_what_is_not_known() -> None:
-    columns = [
-        Column("name"),
-        Column("error", group="group", best=True, note="remark"),
-        Column("nothing", 0, "group"),
-        Column("certified", "robust", "other"),
-    ]
-    rows = [{"name": "a", "error": 2.0, 0: None, "robust": True}, {"name": "b", "error": 1.0, 0: np.nan, "remark": "r"}]
-    table = build("caption", columns, rows, chosen="b")
-    assert table is not None
-    assert list(table.head) == ["name", "error", "certified"]
-    assert list(table.groups) == [("", 1), ("group", 1), ("other", 1)]
-    assert [[c.text for c in cells] for cells in table.rows] == [["a", "2.00", "yes"], ["b", "1.00", "–"]]
-    assert [(cells[1].strong, cells[1].note) for cells in table.rows] == [(False, ""), (True, "r")]
-    assert list(table.chosen) == [1]
-    assert build("empty", columns, []) is None
-    assert build("unknown", columns, [{"name": "a", "error": None}]) is None
-
-
-def test_the_mean_is_geometric_and_infinite_where_an_estimate_diverged() -> None:
-    rows = [row(NAME, 1.0), row(NAME, 4.0, channel="current"), row("l/h2", None), row("l/h2", 1.0, channel="current")]
-    (table,) = Facts(metrics(evaluation=rows)).tables
-    assert table.mean(NAME, ["velocity", "current"]) == pytest.approx(2.0)
-    assert table.mean("l/h2", ["velocity", "current"]) == float("inf")
 
 
 def test_a_run_ends_with_a_verdict_numbers_and_a_path(tmp_path: Path) -> None:
@@ -253,19 +182,9 @@ def test_the_head_names_every_hidden_state_and_its_worst_condition(tmp_path: Pat
     assert force == "error of force: 8.00 % of the largest value (worst unit b: 8.00 %; cold: 45.0 %)"
     assert "force (45.0 %" in judge(Facts(metrics(evaluation=rows, **conditions))).reasons[-1].text
     rows.append(row(NAME, None, unit="c", channel="velocity") | {"condition": "cold"})
-    assert judge(Facts(metrics(evaluation=rows, **conditions))).status is Status.NOT_READY
-    assert any(
-        "cold: diverged" in line for line in lines_of(RunResult(tmp_path, metrics(evaluation=rows, **conditions)))
-    )
-
-
-def test_a_channel_without_a_unit_has_numbers_alone() -> None:
-    entry = {"set_certified": True, "set_bound": {"force": 0.003}}
-    rows = [row(NAME, 0.2, channel="force"), row("koopman/open_loop", 0.9, channel="force")]
-    verdict = judge(Facts(metrics(observers={NAME: entry}, evaluation=rows)))
-    assert verdict.reasons[0].text.endswith("force of unit b has 0.00400, expected were 0.00300.")
-    assert "is at most 0.00300 in force (exceeded by unit b);" in verdict.certified[0]
-    assert verdict.numbers[0].notes[0] == "RMS 0.00400"
+    diverged = metrics(evaluation=rows, **conditions)
+    assert judge(Facts(diverged)).status is Status.NOT_READY
+    assert any("cold: diverged" in line for line in lines_of(RunResult(tmp_path, diverged)))
 
 
 def lines_of(result: RunResult) -> list[str]:
@@ -291,3 +210,16 @@ def test_a_large_error_is_a_reason_to_check() -> None:
     verdict = judge(Facts(metrics(evaluation=[row(NAME, 13.1), row("koopman/open_loop", 40.0)])))
     assert verdict.status is Status.CHECK
     assert [r.text for r in verdict.reasons] == ["The error is large: velocity (13.1 % of the largest value)."]
+
+
+def test_errors_that_differ_between_runs_are_means_and_worst_units_of_every_run() -> None:
+    better = metrics(evaluation=[row(NAME, 0.1), row(NAME, 0.3, "c"), row("koopman/b", None)])
+    first, second = ({"identify": {"refine": refine}} for refine in (True, False))
+    found = differences([compared(first, Facts(metrics())), compared(second, Facts(better))])
+    assert found["settings"] == {"identify.refine": [True, False]}
+    assert found["errors in percent"] == {
+        f"{NAME}: velocity, default, worst unit": [0.2, 0.3],
+        "koopman/open_loop: velocity, default": [0.9, None],
+        "koopman/open_loop: velocity, default, worst unit": [0.9, None],
+        "koopman/b: velocity, default": [None, "diverged"],
+    }

@@ -10,14 +10,8 @@ from kros.report.facts import Facts
 def evaluation(units=8, seed=0):
     rng = np.random.default_rng(seed)
     return [
-        {
-            "observer": o,
-            "unit": f"u{i}",
-            "role": "nominal" if i == 0 else "off_nominal",
-            "condition": "noload",
-            "channel": c,
-            "error_percent": e,
-        }
+        {"observer": o, "unit": f"u{i}", "role": "off_nominal" if i else "nominal", "condition": "noload"}
+        | {"channel": c, "error_percent": e}
         for o in ("a", "b")
         for c in ("v", "i")
         for i, e in enumerate(rng.uniform(1, 2, units))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,9 +26,13 @@ STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "targe
 def population() -> Population:
     """Four DC motors, given as arrays."""
     made = PLANTS["dc-motor"](n_units=4, n_episodes=3, seconds=1.2, seed=3).simulate().population
-    data = {unit: [made.read(key) for key in made.keys(unit)] for unit in made.unit_ids}
-    period = made.sample_period_s
-    return kros.from_arrays(data, states=made.states, inputs=made.inputs, measured=["position"], sample_period_s=period)
+    return given(made, {unit: [made.read(key) for key in made.keys(unit)] for unit in made.unit_ids})
+
+
+def given(population: Population, data: dict[str, Any]) -> Population:
+    """Other arrays with the names of a population."""
+    names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
+    return kros.from_arrays(data, **names, sample_period_s=population.sample_period_s)
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +52,7 @@ def test_states_start_where_they_do_in_training(population: Population) -> None:
     """A position and a current that are never near zero: every model would begin with their full size as an error."""
     moved = np.array([20.0, 0.0, 100.0, 20.0])
     data = {u: [population.read(key) + moved for key in population.keys(u)] for u in population.unit_ids}
-    names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
-    other = kros.from_arrays(data, **names, sample_period_s=population.sample_period_s)
-    found = kros.quantify(kros.identify(other, refine=False), n_freqs=60, max_order=1)
+    found = kros.quantify(kros.identify(given(population, data), refine=False), n_freqs=60, max_order=1)
     first = np.array([data[key.unit][int(key.episode)][0] for key in found.models.facts.train])[:, :3]
     mean, error = first.mean(axis=0), first.var(axis=0) / len(first)
     expected = mean * np.maximum(1 - error / mean**2, 0)  # James and Stein
@@ -74,9 +77,8 @@ def test_a_method_may_have_other_options(uncertain: UncertainModels) -> None:
     design = kros.synthesize(uncertain, first, methods=())
     assert design.name == "linear_edmd/worst_case_h2"
     assert 0 < design.lower_bound <= design.facts["worst_case_h2"]  # type: ignore[operator]
-    with pytest.raises(
-        ConfigError, match=r"there is no method Refusing.* for these models; known are linear_edmd/open_loop"
-    ):
+    match = r"there is no method Refusing.* for these models; known are linear_edmd/open_loop"
+    with pytest.raises(ConfigError, match=match):
         kros.synthesize(uncertain, Refusing(), methods=())
 
 
@@ -89,32 +91,30 @@ def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainMod
 
 
 def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Population) -> None:
-    with pytest.raises(ConfigError, match="no method 'memory' for these models; known are linear_edmd/open_loop"):
-        kros.synthesize(uncertain, method="memory")
-    with pytest.raises(DimensionError, match=r"Quantify: needs .*, found Population; .*the result of kros.identify"):
-        kros.quantify(population)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="Synthesize: needs UncertainModels, found IdentifiedModels"):
-        kros.synthesize(uncertain.models)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="Identify: needs Population, found dict; read recordings"):
-        kros.identify({"a": []})
-    with pytest.raises(ConfigError, match="Run: needs a Population, a folder or a study, found dict"):
-        kros.run({"a": []}, "out")
-    with pytest.raises(ConfigError, match=r"data\.source and data\.reader name recordings"):
-        kros.run(population, "out", data={"reader": "parquet"})
-    with pytest.raises(ConfigError, match="there is no method 'learned'"):
-        kros.synthesize(uncertain, method="learned")
-    with pytest.raises(ConfigError, match=r"Synthesize: metods: unknown key; did you mean 'methods'\?"):
-        kros.synthesize(uncertain, None, **{"metods": ()})
-    with pytest.raises(ConfigError, match="Identify: alpha"):
-        kros.identify(population, alpha=-0.5)
-    with pytest.raises(ConfigError, match="is one text; give a list"):
-        kros.identify(population, "sin(position)")
-    with pytest.raises(ConfigError, match="Quantify: form"):
-        kros.quantify(uncertain.models, form="additiv")
-    with pytest.raises(DataError, match="identify_on = 'loaded'"):
-        kros.identify(population, identify_on="loaded")
-    with pytest.raises(DataError, match="there are none, only linear_edmd"):
-        uncertain.models.models("koopman")
+    motors, models = population, uncertain.models
+    for call, message in (
+        (
+            lambda: kros.synthesize(uncertain, "memory"),
+            "no method 'memory' for these models; known are linear_edmd/open",
+        ),
+        (lambda: kros.synthesize(uncertain, "learned"), "there is no method 'learned'"),
+        (
+            lambda: kros.synthesize(uncertain, None, metods=()),
+            r"Synthesize: metods: unknown key; did you mean 'methods'\?",
+        ),
+        (lambda: kros.synthesize(models), "Synthesize: needs UncertainModels, found IdentifiedModels"),
+        (lambda: kros.quantify(motors), r"Quantify: needs .*, found Population; .*the result of kros.identify"),
+        (lambda: kros.quantify(models, form="additiv"), "Quantify: form"),
+        (lambda: kros.identify({"a": []}), "Identify: needs Population, found dict; read recordings"),
+        (lambda: kros.identify(motors, alpha=-0.5), "Identify: alpha"),
+        (lambda: kros.identify(motors, "sin(position)"), "is one text; give a list"),
+        (lambda: kros.identify(motors, identify_on="loaded"), "identify_on = 'loaded'"),
+        (lambda: kros.run({"a": []}, "out"), "Run: needs a Population, a folder or a study, found dict"),
+        (lambda: kros.run(motors, "out", data={"reader": "parquet"}), r"data\.source and data\.reader name recordings"),
+        (lambda: models.models("koopman"), "there are none, only linear_edmd"),
+    ):
+        with pytest.raises((ConfigError, DataError, DimensionError), match=message):
+            call()
 
 
 def test_units_that_were_not_recorded_where_it_counts_are_named(
@@ -125,8 +125,7 @@ def test_units_that_were_not_recorded_where_it_counts_are_named(
         unit: {"cold" if i < 2 else "warm": [population.read(k) for k in keys(unit)]}
         for i, unit in enumerate(population.unit_ids)
     }
-    names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
-    found = kros.identify(kros.from_arrays(data, **names, sample_period_s=population.sample_period_s), refine=False)
+    found = kros.identify(given(population, data), refine=False)
     assert len(found.models().unit_ids) == 2
     assert f"Units {', '.join(population.unit_ids[2:])} were not recorded in condition 'cold'" in caplog.text
 
@@ -134,28 +133,19 @@ def test_units_that_were_not_recorded_where_it_counts_are_named(
 def test_episodes_with_gaps_can_be_dropped(population: Population, tmp_path) -> None:  # type: ignore[no-untyped-def]
     data = {unit: [population.read(k).copy() for k in population.keys(unit)] for unit in population.unit_ids}
     data[population.unit_ids[0]][1][7, 2] = np.nan
-    names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
-    gaps = kros.from_arrays(data, **names, sample_period_s=population.sample_period_s)
+    gaps = given(population, data)
     with pytest.raises(DataError, match="NaN"):
         kros.identify(gaps, refine=False)
     found = kros.identify(gaps, refine=False, on_nan="drop_episode")
     assert len(found.facts.dropped) == 1
-    run = kros.run(
-        gaps, tmp_path / "run", until="identify", identify={"refine": False}, data={"on_nan": "drop_episode"}
-    )
+    run = kros.run(gaps, tmp_path / "run", until="read", data={"on_nan": "drop_episode"})
     assert run.metrics["study"]["units"] == len(population.unit_ids)
 
 
 def recorded(states: Sequence[str] = STATES, **metadata: float) -> Population:
     samples = np.random.default_rng(0).standard_normal((2, 50, len(states) + 2))
-    return kros.from_arrays(
-        {"a": list(samples)},
-        states=states,
-        inputs=INPUTS,
-        measured=[states[0]],
-        sample_period_s=1e-3,
-        metadata=metadata,
-    )
+    names = {"states": states, "inputs": INPUTS, "measured": [states[0]]}
+    return kros.from_arrays({"a": list(samples)}, **names, sample_period_s=1e-3, metadata=metadata)
 
 
 @pytest.mark.parametrize(

@@ -55,31 +55,20 @@ def test_a_unit_beyond_the_bound_is_an_outlier_where_enough_units_made_it(
     assert (f"from {units} units of which {FEWEST} are needed" in row["reason"]) == (units < FEWEST)
 
 
+SCORED = {"unit": "a", "condition": "cold", "score": 1.0, "threshold": 2.0, "status": "ok"}
+SCORED |= {"outlier": False, "units": 12, "left_out": []}
+
+
 def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_text() -> None:
-    plain = {
-        "score": 1.0,
-        "threshold": 2.0,
-        "detectable": {"force": 5.0},
-        "units": 12,
-        "fewest_units": 14,
-        "left_out": [],
-        "outlier": False,
-    }
+    plain, hostile = SCORED | {"detectable": {"force": 5.0}, "fewest_units": 14}, '<b "\x00\u202e&'
+    stated = [("a", "cold", "ok"), (hostile, "cold", "ok"), (hostile, "hot", "cannot tell")]
+    stated += [("c", "cold", "outlier"), ("c", "hot", "cannot tell")]
     rows = [
         with_verdict(plain | {"unit": unit, "condition": condition, "status": status, "outlier": status == "outlier"})
-        for unit, condition, status in (
-            ("a", "cold", "ok"),
-            ('<b "\x00\u202e&', "cold", "ok"),
-            ('<b "\x00\u202e&', "hot", "cannot tell"),
-            ("c", "cold", "outlier"),
-            ("c", "hot", "cannot tell"),
-        )
+        for unit, condition, status in stated
     ]
-    assert [line.split()[0] for line in verdict_lines(rows) if not line.startswith(" ")] == [
-        "PASS",
-        "UNDECIDED",
-        "FAIL",
-    ]
+    verdicts = [line.split()[0] for line in verdict_lines(rows) if not line.startswith(" ")]
+    assert verdicts == ["PASS", "UNDECIDED", "FAIL"]
     assert (worst(rows[:1]), worst(rows[:3]), worst(rows)) == ("PASS", "UNDECIDED", "FAIL")
     assert ">&lt;b &#34;" in html_text(rows)
     suite = ElementTree.fromstring(junit_text(rows))
@@ -99,18 +88,6 @@ def test_recordings_of_new_units_are_looked_at_as_those_of_a_study_are(caplog: p
     check_recordings(from_arrays({"a": [first * (1, 0) + (0, 2), other * (1, 0) + (0, 2)]}, CHANNELS, 0.01))
     assert "input 'force' stays where it is in each of 2 episodes, in the first at 2" in caplog.text
     assert "Episode 1 of unit a (default): position jumps by" in caplog.text
-
-
-SCORED = {
-    "unit": "a",
-    "condition": "cold",
-    "score": 1.0,
-    "threshold": 2.0,
-    "status": "ok",
-    "outlier": False,
-    "units": 12,
-    "left_out": [],
-}
 
 
 @pytest.mark.parametrize(
@@ -145,12 +122,9 @@ def test_errors_stand_beside_bounds_with_the_change_of_gain_that_they_exclude() 
     channels = (CHANNELS[0], Channel("velocity", Role.STATE, "m/s", False), CHANNELS[1])
     population = from_arrays({"good": [whole], "bad": [whole * (1.0, 0.4, 1.0)]}, channels, 0.01)
     bound = 0.5 * float(x[:, 1].std())
-    context = SimpleNamespace(
-        facts=SimpleNamespace(identify_on="default"),
-        deployed=one.observer,
-        observers_record={"facts": {one.observer.name: {"set_bound": {"velocity": bound, "position": 1.0}}}},
-        config=SimpleNamespace(sensor={}),
-    )
+    record = {"facts": {one.observer.name: {"set_bound": {"velocity": bound, "position": 1.0}}}}
+    facts, config = SimpleNamespace(identify_on="default"), SimpleNamespace(sensor={})
+    context = SimpleNamespace(facts=facts, deployed=one.observer, observers_record=record, config=config)
     found = errors_beside_bounds(context, population, {"good": {}, "bad": {}})
     ((good,), (bad,)) = found["good", "default"], found["bad", "default"]
     assert (good["state"], good["unit"], good["bound"]) == ("velocity", "m/s", bound)

@@ -56,11 +56,10 @@ def test_a_mapping_of_csv_columns_is_refused(tmp_path):
 
 def drives(unsteady: str, condition: str) -> Population:
     """Drives, one of which never runs at constant velocity and is recorded in a condition of its own."""
-    whole = (
-        PLANTS["harmonic-drive"](n_units=3, n_episodes=2, seconds=3.0, seed=2, conditions=("noload",))
-        .simulate()
-        .population
-    )
+    simulated = PLANTS["harmonic-drive"](
+        n_units=3, n_episodes=2, seconds=3.0, seed=2, conditions=("noload",)
+    ).simulate()
+    whole = simulated.population
     keys = {EpisodeKey(k.unit, condition if k.unit == unsteady else k.condition, k.episode): k for k in whole.episodes}
     velocity = (whole.states + whole.inputs).index("target_velocity")
 

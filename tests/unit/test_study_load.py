@@ -25,20 +25,20 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
     splits = split_episodes(population).values()
     train, test = (tuple(k for s in splits for k in getattr(s, part)) for part in ("train", "test"))
     facts = RecordingFacts("noload", dict.fromkeys(population.unit_ids, "population"), train, test, {})
+    few = EstimatorSettings(rows=3000, sample=1000, folds=2, parts=2, features=0, gap_samples=20_000)
+    identified = SimpleNamespace(
+        kinds=("linear",),
+        parameters={unit: {} for unit in population.unit_ids},
+        models=lambda name=None: SimpleNamespace(measured=(0,)),
+        population=population,
+        sizes=dict.fromkeys(population.states + population.inputs, 7.0),
+    )
     return SimpleNamespace(
-        config=SimpleNamespace(
-            load=LoadConfig(**options), estimator=EstimatorSettings(rows=3000, sample=1000, folds=2, parts=2)
-        ),
+        config=SimpleNamespace(load=LoadConfig(**options), estimator=few),
         facts=facts,
         population=population,
         lifting=Lifting(population.states),
-        identified=SimpleNamespace(
-            kinds=("linear",),
-            parameters={unit: {} for unit in population.unit_ids},
-            models=lambda name=None: SimpleNamespace(measured=(0,)),
-            population=population,
-            sizes=dict.fromkeys(population.states + population.inputs, 7.0),
-        ),
+        identified=identified,
         uncertain=SimpleNamespace(nominal="001001"),
         store=Store(folder),
     )

@@ -30,6 +30,7 @@ source = "{source}"
 reader = "parquet"
 [identify]
 refine = false
+alpha = 30.0
 [uncertainty]
 form = "additive"
 n_freqs = 60
@@ -70,9 +71,7 @@ def run(kros, tmp_path_factory) -> Path:
     """A study of twelve drives, ten episodes each, regularised as much as it needs not to be, so that the amount of data matters."""
     folder = tmp_path_factory.mktemp("check")
     source = recordings(folder / "batch", BATCH, 10, 400)
-    (folder / "study.toml").write_text(
-        STUDY.format(source=source).replace("refine = false", "refine = false\nalpha = 30.0")
-    )
+    (folder / "study.toml").write_text(STUDY.format(source=source))
     result = kros("run", folder / "study.toml", "--out", folder / "run", "--until", "quantify")
     assert result.exit_code == 0, result.output
     return folder / "run"
@@ -181,9 +180,7 @@ def test_a_batch_of_unequal_recordings(kros, tmp_path) -> None:
     """A third of the units was recorded in two of ten episodes: none is flagged for that, and none blinds the others."""
     data = {u: [episode(drive(s), 400, s, e) for e in range(10 if s < 8 else 2)] for u, s in BATCH.items()}
     write_parquet(from_arrays(data, CHANNELS, PERIOD_S), tmp_path / "mixed")
-    (tmp_path / "study.toml").write_text(
-        STUDY.format(source=tmp_path / "mixed").replace("refine = false", "refine = false\nalpha = 30.0")
-    )
+    (tmp_path / "study.toml").write_text(STUDY.format(source=tmp_path / "mixed"))
     result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--until", "quantify")
     assert result.exit_code == 0, result.output
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["outliers"]

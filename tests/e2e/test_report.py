@@ -20,9 +20,7 @@ from scipy.signal import welch
 import kros as package
 from kros.core.artifacts import save_artifact, write_json
 from kros.core.errors import ConfigError, DataError
-from kros.core.lti import StateSpace
 from kros.report.figures import FIGURES, draw
-from kros.report.figures.responses import scaled_filter
 from kros.report.figures.uncertainty import entry_names, published_bounds
 from kros.report.files import write_figures
 from kros.report.html import render
@@ -30,7 +28,6 @@ from kros.report.manifest import Artefact, describe, write_manifest
 from kros.report.names import observer_label
 from kros.report.run_folder import RunFolder
 from kros.study.pipeline import RunResult
-from kros.synthesis.result import Injection, Status, Synthesis
 from kros.uncertainty import Form
 from kros.uncertainty.quantify import residuals_beside_weights
 
@@ -212,16 +209,6 @@ def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(pa
         assert axes[3].lines[1].get_ydata() == pytest.approx(density, rel=1e-6)
 
 
-def test_magnitude_and_phase_of_all_units(run) -> None:
-    row = draw("models", run).figure.axes[:4]
-    models = run.models["koopman"]
-    assert [axes.get_title("left").split("\n")[1] for axes in row] == ["magnitude (dB)", "phase (°)"] * 2
-    response = models.scaled_responses(row[0].lines[0].get_xdata(), [run.nominal])[0, :, 0, 1]
-    assert row[2].lines[0].get_label() == f"nominal, unit {run.nominal}"
-    assert row[2].lines[0].get_ydata() == pytest.approx(20 * np.log10(np.abs(response)))
-    assert np.exp(1j * np.radians(row[3].lines[0].get_ydata())) == pytest.approx(response / np.abs(response))
-
-
 def test_output_forms_of_the_paper_never_fall_below_one_and_entries_have_names(run) -> None:
     model, models = run.uncertain["koopman"], run.models["koopman"]
     bounds = published_bounds(model, models)
@@ -229,15 +216,6 @@ def test_output_forms_of_the_paper_never_fall_below_one_and_entries_have_names(r
     assert all(np.all(bound > 1 - 1e-9) for _, bound in bounds.values())
     sizes = tuple(len(names) for names in entry_names(model.form, models))
     assert residuals_beside_weights(models, model).largest.shape[1:] == sizes
-
-
-def test_filter_is_scaled_by_the_ranges(run) -> None:
-    models = run.models["linear"]
-    K = StateSpace([[0.5]], [[1.0]], [[1.0], [2.0]], [[0.0], [0.0]], run.sample_period_s)
-    scaled = scaled_filter(Synthesis("mixed", K, Status.OPTIMAL, Injection.INPUT), models)
-    # innovation of the measurement's range over the pole at one half, correction over the inputs' ranges
-    expected = np.array([2.0, 4.0]) * models.output_scale[0] / models.input_scale
-    assert scaled.frequency_response([0.0])[0, :, 0] == pytest.approx(expected)
 
 
 def test_results_of_the_short_way_are_plotted(demo, metrics) -> None:

@@ -112,14 +112,6 @@ def test_a_stage_that_fails_leaves_the_earlier_run_as_it_was(kros, fast, run, fi
     assert kros("figures", run, run.parent / "figures").exit_code == 0
 
 
-def test_what_does_not_follow_from_the_study_any_more_goes(kros, fast, run):
-    assert again(kros, fast, run, "--until", "identify", "--set", "uncertainty.n_freqs=62").exit_code == 0
-    assert not any(
-        name.startswith(("uncertainty/", "observers/", "evaluation/", "left_out/left_out")) for name in files(run)
-    )
-    assert "models" in {name.partition("/")[0] for name in files(run)}
-
-
 def test_another_study_is_refused_and_the_same_one_may_change(kros, fast, run, pendulums, tmp_path):
     before = results(run)
     other = tmp_path / "other.toml"

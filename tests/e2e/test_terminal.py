@@ -13,37 +13,12 @@ import pytest
 
 import kros as package
 from kros.cli import OnceHandler
-from kros.core.errors import ConfigError
-from kros.study.config import validate_config
 from kros.study.engine.executors import Lines
 
 
 def test_version_and_module():
     said = subprocess.run([sys.executable, "-m", "kros", "--version"], capture_output=True, text=True, check=True)
     assert said.stdout == f"kros {package.__version__}\n"
-
-
-@pytest.mark.parametrize(
-    ("command", "part"),
-    [("check", "a TOML file with [data]"), ("estimate", "a TOML file with [data]"), ("run", "KEY=VALUE")],
-)
-def test_help_keeps_its_brackets(kros, command, part):
-    found = kros(command, "--help")
-    assert found.exit_code == 0
-    assert part in " ".join(found.output.split())
-
-
-@pytest.mark.parametrize(
-    ("tables", "hint"),
-    [
-        ({"identify": {"alpa": 1}}, "'alpha'"),
-        ({"data": {"source": ".", "exlude": []}}, "'exclude'"),
-        ({"evalute": {}}, "'evaluate'"),
-    ],
-)
-def test_keys_that_are_nearly_right(tmp_path, tables, hint):
-    with pytest.raises(ConfigError, match=rf"did you mean {hint}\? known are"):
-        validate_config({"data": {"source": "."}, **tables}, tmp_path)
 
 
 def test_commands_that_are_nearly_right(kros):

@@ -125,9 +125,3 @@ def test_models_come_back_in_the_units_of_the_recordings(first, other):
     assert one.alpha_in_ranges
     assert one.alpha == pytest.approx(scaled.alpha, rel=1e-6)
     assert one.lifting.functions == ("tanh(1.0*velocity)",)
-
-
-def test_an_alpha_that_is_given_is_in_the_units_of_the_recordings(motors, tmp_path):
-    metrics, run = study(motors, (1.0, 1.0, 1.0, 1.0), tmp_path, Stage.IDENTIFY, alpha=90.0)
-    assert metrics["study"]["alpha"] == 90.0
-    assert not ModelSet.load(run / "models" / "koopman_edmd").alpha_in_ranges

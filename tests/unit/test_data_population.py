@@ -8,8 +8,6 @@ import pytest
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, split_episodes
 from kros.data.population import natural_key
-from kros.data.prepare import assemble
-from kros.data.readers.arrays import ArrayRecordings
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("u", Role.INPUT))
 
@@ -55,9 +53,3 @@ def test_split_by_name_and_its_refusals() -> None:
         split_episodes(whole, ["0", "1", "2", "3"])
     with pytest.raises(DataError, match=r"unit a \(hot\) into training and test needs at least two, found 1"):
         split_episodes(population({("a", "hot"): 1}))
-
-
-def test_inputs_before_states_are_refused_where_columns_are_fixed() -> None:
-    recordings = ArrayRecordings({EpisodeKey("a", "hot", "0"): (np.ones((5, 2)), None)})
-    with pytest.raises(DataError, match="Channels should list states before inputs"):
-        assemble(recordings, CHANNELS[::-1], sample_period_s=0.1)

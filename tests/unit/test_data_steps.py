@@ -175,23 +175,6 @@ def test_steps_that_do_not_fit_are_refused_before_reading(step: steps.Step, mess
         prepare(population(counting()), [step])
 
 
-@pytest.mark.parametrize(("name", "of", "message"), [("y", "", "names should differ"), ("v", "u", "truth of")])
-def test_derivatives_that_do_not_fit_are_refused_before_reading(name: str, of: str, message: str) -> None:
-    with pytest.raises(DataError, match=message):
-        prepare(population(counting()), [steps.Differentiate("x", name, 1.0, of=of)])
-
-
-def test_steps_from_toml() -> None:
-    tables: list[Any] = [
-        {"step": "scale", "channels": ["x", "y"], "factor": 2},
-        {"step": "trim", "start": 10, "tail": 2},
-        {"step": "resample", "period_s": 0.01},
-        steps.Shift(("u",), 1),
-    ]
-    expected = (steps.Scale(("x", "y"), 2.0), steps.Trim(10, None, 2), steps.Resample(0.01), steps.Shift(("u",), 1))
-    assert parse_steps(tables) == expected
-
-
 @pytest.mark.parametrize(
     ("table", "message"),
     [

@@ -75,15 +75,6 @@ def test_a_csv_mapping_declares_a_truth(tmp_path: Path) -> None:
     found = read(tmp_path, "csv", {"files": r"(?P<unit>\w)\.csv", "sample_period_s": 0.1, "channel": channel})
     assert (found.states, found.inputs, found.true_states) == (("x",), ("u",), (0,))
     np.testing.assert_array_equal(found.read_with_truths(found.episodes[0])[1], rows["a"][:, [1]])
-    hidden = [
-        *channel,
-        {"name": "v", "role": "state", "column": "gone"},
-        {"name": "v_true", "role": "truth", "of": "v", "column": "w"},
-    ]
-    in_the_field = read(
-        tmp_path, "csv", {"files": r"(?P<unit>\w)\.csv", "sample_period_s": 0.1, "channel": hidden}, optional=["v"]
-    )
-    assert [c.name for c in in_the_field.columns] == ["x", "u", "x_true"]
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import logging
 
 from kros.design.baselines import BASELINES
-from kros.design.methods import METHODS, methods_of, preferred, suitable
+from kros.design.methods import METHODS, methods_of, suitable
 from kros.observer import EstimatorSettings
 from kros.report.names import LABELS
 from kros.report.theme import Tone
@@ -39,9 +39,3 @@ def test_what_does_not_suit_refined_models_is_left_out_with_the_reason(caplog):
     assert names(wanted, "koopman") == ["open_loop", "worst_case_h2"]
     for method in ("mixed", "paper"):
         assert f"koopman/{method} is not designed: it is for the paper's models; set identify.refine" in caplog.text
-
-
-def test_the_best_guarantee_is_deployed():
-    made = ["koopman/open_loop", "koopman/residual_h2", "koopman/worst_case_h2", "linear/worst_case_h2"]
-    assert preferred(made) == "koopman/worst_case_h2"
-    assert preferred(["koopman/ekf"]) is None

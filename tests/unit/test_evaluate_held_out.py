@@ -43,17 +43,11 @@ def test_outcomes_of_blocks_are_those_of_all_episodes_at_once(at_once, monkeypat
             np.testing.assert_array_equal(piece, share * population.read(key)[:, :2])
 
 
-def test_no_episodes_are_refused_with_a_reason():
-    with pytest.raises(DataError, match="no episodes were named; check the split"):
-        HeldOut(population_of(1), (), {}).outcomes(run)
-
-
-def test_an_episode_that_is_named_twice_is_refused():
+def test_episodes_that_are_none_twice_or_not_there_are_refused():
     population = population_of(1)
+    one, other = population.episodes[0], EpisodeKey("unit 9", "default", "0")
+    for keys, message in (((), "no episodes were named; check the split"), ((other,), "unit 9")):
+        with pytest.raises(DataError, match=message):
+            HeldOut(population, keys, {}).outcomes(run)
     with pytest.raises(DataError, match=r"episode 0 of unit .* named more than once"):
-        EpisodeBatch.read(population, [population.episodes[0]] * 2)
-
-
-def test_an_episode_that_does_not_exist_is_named():
-    with pytest.raises(DataError, match="unit 9"):
-        HeldOut(population_of(1), (EpisodeKey("unit 9", "default", "0"),), {}).outcomes(run)
+        EpisodeBatch.read(population, [one, one])

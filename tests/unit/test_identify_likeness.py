@@ -105,13 +105,6 @@ def test_a_batch_with_spread_and_a_unit_that_is_moved_less_are_not_doubted(motor
     assert alerts(motors, data) == ()
 
 
-def test_moments_are_covariances_of_channels_and_changes() -> None:
-    values = np.random.default_rng(0).normal(size=(50, 2)).cumsum(axis=0)
-    wide = np.hstack([values[1:], values[1:] - values[:-1]])
-    np.testing.assert_allclose(moments(values), (wide - wide.mean(axis=0)).T @ (wide - wide.mean(axis=0)) / 49)
-    assert unlike(["x", "rest"], {unit: {"run": np.diag([1.0, 0, 1, 0])} for unit in "abc"}) == []
-
-
 @pytest.mark.parametrize("resting", [0.0, 1e-20])
 def test_a_channel_that_rests_in_one_unit_or_in_most_has_no_unit_of_measure(resting: float) -> None:
     moving = np.eye(4)

@@ -7,8 +7,8 @@ import pytest
 from random_models import random_models
 
 from kros.core import DataError, DimensionError
-from kros.identify import KoopmanMatrices, ModelSet, free_run
-from kros.identify.edmd import ModelSamples, bootstrap_edmd, episode_weights
+from kros.identify import ModelSet, free_run
+from kros.identify.edmd import bootstrap_edmd, episode_weights
 from kros.identify.refine import GaussNewton
 from kros.lifting import Lifting
 
@@ -26,20 +26,6 @@ def test_a_unit_with_fewer_episodes_is_resampled_among_its_own() -> None:
     wide = np.concatenate([weights, np.zeros((1, 6, 2))], axis=2)
     own, found = bootstrap_edmd(R, 2, 0.0, weights), bootstrap_edmd(padded, 2, 0.0, wide)
     np.testing.assert_allclose(found.samples.A, own.samples.A, rtol=1e-9)
-
-
-def test_responses_of_samples_are_those_of_their_models() -> None:
-    rng = np.random.default_rng(1)
-    A, B = np.array([[0.8, 0.1], [-0.2, 0.7]]), np.array([[0.1, 0.0], [1.0, 0.5]])
-    noise = 0.02 * rng.normal(size=(2, 2, 40, 2, 2))
-    whole = KoopmanMatrices(np.tile(A, (2, 1, 1)), np.tile(B, (2, 1, 1)))
-    drawn = ModelSamples(whole, KoopmanMatrices(A + noise[0], B + noise[1]))
-    freqs, dt = np.array([0.0, 3.0, 50.0]), 0.01
-    for unit in range(2):
-        found = drawn.samples[unit].responses(freqs, dt)
-        for k, z in enumerate(np.exp(2j * np.pi * freqs * dt)):
-            for draw, (A, B) in enumerate(zip(drawn.samples.A[unit], drawn.samples.B[unit], strict=True)):
-                np.testing.assert_allclose(found[draw, k], np.linalg.inv(z * np.eye(2) - A) @ B, rtol=1e-7)
 
 
 def test_search_stays_within_the_constraint_and_finds_both_minima() -> None:

@@ -5,7 +5,7 @@ import pytest
 from random_models import random_observer
 
 from kros.core.errors import ConfigError, DataError, DimensionError, IdentificationError
-from kros.identify import combine, edmd, free_run
+from kros.identify import edmd, free_run
 from kros.identify.factors import Factor, lifted_factor, reduce_episode, require_excitation
 from kros.lifting import Lifting
 from kros.observer import run_observer
@@ -63,34 +63,6 @@ def test_free_run_equals_a_plain_loop(shared):
             theta, lifted_u = by_hand(x, u[i], k, phases[i])
             x[k + 1] = ((A if shared else A[i]) @ theta + (B if shared else B[i]) @ lifted_u)[:2]
         np.testing.assert_allclose(found[i], x, rtol=1e-11, atol=1e-12)
-
-
-def test_factors_give_the_models_of_plain_least_squares():
-    """Two units of two episodes each, one of them as long as the history allows."""
-    rng = np.random.default_rng(2)
-    phases = np.array([0.3, 2.0])
-    episodes = [[recording(60, seed=10 * i + j) for j in range(2)] + [recording(5, seed=99 + i)] for i in range(2)]
-    reduced = [[reduce_episode(x, u, DELAYED) for x, u in unit] for unit in episodes]
-    factor = Factor.stack([combine(Factor.stack(unit)) for unit in reduced])
-    lifted = lifted_factor(factor, DELAYED, {"phase": phases}, DELAYED)
-    alpha = float(rng.uniform(0.1, 1))
-    found = edmd(lifted.R, 5, alpha)
-    linear = edmd(lifted_factor(factor, DELAYED, {"phase": phases}, Lifting(STATES)).R, 2)
-    assert factor.n_samples.tolist() == [2 * 56 + 1] * 2
-    for i, unit in enumerate(episodes):
-        rows, after, plain, plain_after = [], [], [], []
-        for x, u in unit:
-            for k in range(3, len(x) - 1):
-                rows.append(np.concatenate(by_hand(x, u, k, phases[i])))
-                after.append(by_hand(x, u, k + 1, phases[i])[0])
-                plain.append([*x[k], *u[k]])
-                plain_after.append(x[k + 1])
-        Psi = np.array(rows)
-        U = np.linalg.solve(Psi.T @ Psi + alpha * np.eye(9), Psi.T @ np.array(after)).T
-        np.testing.assert_allclose(np.hstack([found.A[i], found.B[i]]), U, rtol=1e-9, atol=1e-10)
-        assert np.all(lifted.peak[i] >= np.abs(Psi).max(axis=0) - 1e-12)
-        L = np.linalg.lstsq(np.array(plain), np.array(plain_after), rcond=None)[0].T
-        np.testing.assert_allclose(np.hstack([linear.A[i], linear.B[i]]), L, rtol=1e-9, atol=1e-10)
 
 
 def test_an_episode_shorter_than_the_history_is_refused():

@@ -170,13 +170,3 @@ def test_bounds_hold_in_exact_arithmetic(text, middle, half):
                 continue
             if exact.is_real and exact.is_finite:
                 assert sp.Float(lower[0], 60) <= exact <= sp.Float(upper[0], 60), (text, tree, corner)
-
-
-@pytest.mark.parametrize(
-    ("text", "box", "secant"),
-    [("1e18*tanh(40*x)", (0.5, 1.0), 16.9933), ("1e15*(sin(x) - x)", (-1e-8, 1e-8), -0.0166667)],
-)
-def test_slopes_hold_where_everything_cancels(text, box, secant):
-    """Secants computed in 60 digits."""
-    lower, upper = Lifting(("x",), (text,)).slope_bounds({"x": box})
-    assert lower[0, 0] <= secant <= upper[0, 0]

@@ -14,23 +14,18 @@ from kros.synthesis import Injection
 ENDLESS = {
     "powers of powers": "((((9**64)**64)**64)**64)*x",
     "powers of a fraction near one": "((10**60*x)**8)**8",
-    "powers of pi": "((pi**64)**64)*x",
     "exponentials": "exp(exp(exp(exp(exp(exp(64))))))*x",
     "factors": "*".join(f"(x+{i})" for i in range(250)),
-    "equal factors": "*".join("x" for _ in range(250)),
     "roots": "sqrt(" * 60 + "x" + ")" * 60,
-    "functions": "tan(" * 30 + "x" + ")" * 30,
     "divisions": "1/(1+" * 40 + "x" + ")" * 40,
     "terms": "+".join("x" for _ in range(900)),
     "signs": "-" * 1900 + "x",
     "parentheses": "(" * 900 + "x" + ")" * 900,
     "digits": "9" * 1990 + "*x",
-    "hexadecimal digits": "0x" + "f" * 1900 + "*x",
     "an infinite number": "1e999*x",
     "a division by zero": "(1/0)*x",
     "an infinite difference": "(1e308*10-1e308*10)*x",
     "a complex number": "(-8)**(1/3)*x",
-    "a logarithm of zero": "log(0)*x",
     "merged exponents": "(x**64)**64",
     "hidden exponents": "exp(200*log(x))",
     "a tower": "**".join(["2"] * 40) + "*x",
@@ -73,9 +68,7 @@ def test_multiplying_out_has_an_end():
         lambda: check_family(
             {"kind": "radial", "names": ["x"], "length": 1, "centres": {"kind": "kmeans", "n": 10**12, "seed": 0}}
         ),
-        lambda: check_family({"kind": "harmonics", "angle": 5}),
         lambda: check_family({"kind": "harmonics", "angle": "x", "ratio": 10**400}),
-        lambda: check_family({"kind": "harmonics", "angle": "x", "orders": 3}),
         lambda: check_family({"kind": "polynomials", "names": ["x"], "degree": float("inf")}),
     ],
 )

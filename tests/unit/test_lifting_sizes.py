@@ -41,14 +41,6 @@ def test_values_and_slopes_are_those_of_the_formulas_over_their_sizes():
     np.testing.assert_allclose(scaled.slopes(window, values) * out[2:, None], recorded, rtol=1e-6)
 
 
-def test_boxes_are_in_the_same_sizes():
-    plain = Lifting(("x",), ("x**2",))
-    np.testing.assert_allclose(plain.slope_bounds({"x": (-1.0, 3.0)})[1], 6.0)
-    np.testing.assert_allclose(
-        plain.in_sizes({"x": 100.0, "x**2": 50.0}).slope_bounds({"x": (-0.01, 0.03)})[1], 6.0 * 100 / 50
-    )
-
-
 def test_sizes_travel_between_processes_and_into_files(tmp_path):
     scaled, path = FULL.in_sizes(SIZES), tmp_path / "observer.json"
     assert pickle.loads(pickle.dumps(scaled)) == scaled

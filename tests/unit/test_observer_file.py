@@ -131,14 +131,6 @@ def filters(**changes: Any) -> Observer:
     )
 
 
-def test_a_filter_bank_goes_through_its_file(tmp_path: Path) -> None:
-    filters().save(tmp_path / "observer.json")
-    loaded = Observer.load(tmp_path / "observer.json")
-    assert loaded.bank is not None
-    assert loaded.recorded == ("position",)
-    np.testing.assert_array_equal(loaded.bank.start, np.ones((5, 7)))
-
-
 @pytest.mark.parametrize(
     ("changes", "error", "match"),
     [

@@ -51,11 +51,6 @@ def test_outlier_is_loose_by_its_severity():
     assert "000000" not in replace(SMALL, outlier=False).simulate().population.unit_ids
 
 
-def test_load_torque_belongs_to_loaded_episodes(small):
-    assert small.truth.load_torque[LOADED].shape == (3000,)
-    assert replace(LOADED, condition="noload") not in small.truth.load_torque
-
-
 @pytest.mark.parametrize(
     "settings",
     [

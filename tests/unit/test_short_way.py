@@ -17,7 +17,7 @@ from kros.identify.presets import lifting_settings, resolve_lifting, resolve_pha
 from kros.identify.settings import CalibrationSettings
 from kros.observer import run_observer
 from kros.plants import PLANTS
-from kros.uncertainty import UncertainModels, quantify
+from kros.uncertainty import UncertainModels
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
 
@@ -177,10 +177,3 @@ def test_a_ratio_that_does_not_follow_is_asked_for(functions: list[str]) -> None
     lifting = resolve_lifting(lifting_settings(functions), CalibrationSettings(), population)
     with pytest.raises(ConfigError, match=r"set calibrate\.ratio"):
         resolve_phase(CalibrationSettings(), population, lifting)
-
-
-def test_systems_are_quantified_by_the_same_verb(uncertain: UncertainModels) -> None:
-    systems = uncertain.models.models().systems()
-    options = {"freqs_hz": np.geomspace(0.5, 100, 40), "max_order": 1}
-    found = kros.quantify(systems, "additive", **options)
-    assert found.peak_db == quantify(systems, "additive", **options).peak_db

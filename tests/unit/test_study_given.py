@@ -35,13 +35,6 @@ def test_what_is_declared_about_recordings_is_read_again_where_it_changed(tmp_pa
     assert after == before | {first.id: "outliers"}
 
 
-def test_units_that_are_excluded_take_no_part(tmp_path):
-    given = population()
-    assert tuple(groups(given, tmp_path / "run", exclude=[given.unit_ids[0]])) == given.unit_ids[1:]
-    with pytest.raises(ConfigError, match="no unit nobody"):
-        groups(given, tmp_path / "none", exclude=["nobody"])
-
-
 def test_preparation_steps_are_applied_to_what_is_given(tmp_path):
     groups(population(), tmp_path / "run", prepare=[{"step": "resample", "period_s": 0.004}])
     assert kros.read(tmp_path / "run" / "recordings").sample_period_s == 0.004

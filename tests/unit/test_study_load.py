@@ -25,7 +25,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
     splits = split_episodes(population).values()
     train, test = (tuple(k for s in splits for k in getattr(s, part)) for part in ("train", "test"))
     facts = RecordingFacts("noload", dict.fromkeys(population.unit_ids, "population"), train, test, {})
-    few = EstimatorSettings(rows=3000, sample=1000, folds=2, parts=2, features=0, gap_samples=20_000)
+    few = EstimatorSettings(rows=3000, sample=1000, folds=2, parts=2, delays=20, features=0, gap_samples=9_000)
     identified = SimpleNamespace(
         kinds=("linear",),
         parameters={unit: {} for unit in population.unit_ids},

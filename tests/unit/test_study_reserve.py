@@ -16,15 +16,6 @@ def rows(percent: dict[str, float | None], channel: str = "velocity") -> list[di
     ]
 
 
-def test_errors_of_the_reserve_are_scaled_by_those_of_the_study() -> None:
-    """The larger error of two units decides, in both measures."""
-    found = bounds_of(rows({"a": 1.0, "b": 2.0}), rows({"c": 3.0, "d": 5.0}), ["velocity"], 0.6)
-    assert found == {
-        "bounds": {"velocity": {"error_percent": pytest.approx(2.0), "rms": pytest.approx(0.2)}},
-        "reason": None,
-    }
-
-
 def test_an_estimate_that_diverged_on_a_unit_of_the_study_is_no_scale() -> None:
     """Its error is null where it is stored; a channel with such a unit has no bound, others have theirs."""
     known = rows({"c": 3.0, "d": None}) + rows({"c": 1.0, "d": 1.0}, "current")

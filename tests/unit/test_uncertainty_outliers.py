@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from drives import drives
 
 from kros.core.errors import ConfigError, DataError, DimensionError
-from kros.uncertainty import OutlierModel, score_outliers
+from kros.uncertainty import score_outliers
 
 FREQS = np.geomspace(5e-3, 500.0, 150)
 
@@ -38,20 +36,6 @@ def test_order_of_units_and_units_of_measure_do_not_matter() -> None:
     reference = np.array([s.score_db for s in plain.scores])
     np.testing.assert_allclose([s.score_db for s in shuffled.scores], reference[order], atol=1e-9)
     np.testing.assert_allclose([s.score_db for s in scaled.scores], reference, atol=1e-6)
-
-
-def test_new_units_are_scored_against_a_stored_population(tmp_path: Path) -> None:
-    G = responses(13, 4, outlier=True)
-    score_outliers(G[:11], FREQS).save(tmp_path)
-    model = OutlierModel.load(tmp_path)
-    rows = np.searchsorted(FREQS, model.freqs_hz)
-    good, bad = model.score("new", G[11][rows]), model.score("loose", G[12][rows])
-    assert not good.outlier
-    assert bad.outlier
-    assert bad.score_db > good.score_db
-    assert bad.threshold_db == model.threshold_db
-    with pytest.raises(DimensionError, match="same frequencies"):
-        model.score("short", G[11][:3])
 
 
 def test_identical_units_score_zero() -> None:

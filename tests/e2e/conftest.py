@@ -100,7 +100,7 @@ def pendulums(kros, tmp_path_factory) -> Path:
 def demo(kros, recorded, tmp_path_factory) -> Path:
     """A finished study, with fewer rows and points; `tests/e2e/test_report.py` draws all its figures."""
     folder = tmp_path_factory.mktemp("demo")
-    few = '[observer]\nbaselines = ["open_loop", "kalman_tuned", "filtered_difference", "learned", "mean_profile"]\n'
+    few = '[observer]\nbaselines = ["open_loop", "filtered_difference", "learned", "mean_profile"]\n'
     quick = f'[estimator]\n{QUICK}[uncertainty]\nn_freqs = 100\n[synthesis]\nmethods = ["worst_case_h2", "estimator"]\n'
     (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{few}{quick}')
     with two_figures():

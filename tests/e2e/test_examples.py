@@ -7,7 +7,7 @@ import pytest
 pytestmark = pytest.mark.usefixtures("few_figures", "low_order_weights")
 # EDMD models and one method, at few frequencies: the rest is most of the time, and tests of other studies do it.
 QUICK = ["identify.refine=false", 'synthesis.methods=["residual_h2"]', "uncertainty.n_freqs=50"]
-QUICK += ['observer.baselines=["open_loop"]']
+QUICK += ['observer.baselines=["open_loop"]', "estimator.gap_samples=60000", "estimator.folds=2"]
 
 
 def set_to(*settings: str) -> list[str]:

@@ -29,7 +29,7 @@ FAST = (
     "[identify]\nrefine = false\n"
     "[uncertainty]\nn_freqs = 60\n"
     '[synthesis]\nmethods = ["residual_h2"]\n'
-    '[observer]\nbaselines = ["open_loop", "kalman_tuned", "filtered_difference", "learned"]\n'
+    '[observer]\nbaselines = ["open_loop", "filtered_difference", "learned"]\n'
     "[evaluate]\nfolds = {folds}\n"
 )
 

@@ -12,7 +12,7 @@ from pathlib import Path
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
 # the study of the page takes a minute; what it does is the same
 QUICKER = ["identify.refine=false", 'synthesis.methods=["worst_case_h2"]', 'observer.baselines=["open_loop"]']
-QUICKER += ["estimator.rows=4000", "estimator.gap_samples=80000", "uncertainty.n_freqs=60"]
+QUICKER += ["estimator.rows=4000", "estimator.folds=2", "estimator.gap_samples=20000", "uncertainty.n_freqs=60"]
 
 
 def steps() -> list[tuple[str, str]]:

@@ -62,11 +62,8 @@ class Cluster:
         return address
 
     def _run(self, what: str, *options: object) -> subprocess.Popen[bytes]:
-        own = {
-            "OMP_NUM_THREADS": "2",
-            "OPENBLAS_NUM_THREADS": "2",
-            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
-        }
+        own = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "2")
+        own["DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES"] = "1"
         path = os.pathsep.join((str(Path(__file__).parent), *filter(None, sys.path)))
         fixed = ("--no-dashboard", "--scheduler-file", "scheduler.json")
         command = [sys.executable, "-m", f"distributed.cli.dask_{what}", *fixed, *map(str, options)]

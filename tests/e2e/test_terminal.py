@@ -21,10 +21,6 @@ def test_version_and_module():
     assert said.stdout == f"kros {package.__version__}\n"
 
 
-def test_commands_that_are_nearly_right(kros):
-    assert "Did you mean 'figures'?" in kros("figurs", "x").output
-
-
 def test_a_line_is_written_while_a_stage_takes_long(capsys):
     lines = Lines(every_s=0.0)
     lines.start("synthesize", 4)

@@ -20,12 +20,8 @@ from kros.report.manifest import place
 
 @pytest.fixture
 def artifact(tmp_path: Path) -> Path:
-    save_artifact(
-        tmp_path / "x",
-        "model",
-        {"name": "a", "rows": [1.5, None], "deep": {"k": 1}},
-        {"A": np.eye(2), "n": np.array(["u", "v"])},
-    )
+    content, arrays = {"name": "a", "rows": [1.5, None], "deep": {"k": 1}}, {"A": np.eye(2), "n": np.array(["u", "v"])}
+    save_artifact(tmp_path / "x", "model", content, arrays)
     return tmp_path / "x"
 
 
@@ -89,11 +85,8 @@ def test_archives_that_would_unpack_to_anything(tmp_path: Path) -> None:
     np.savez_compressed(path, A=np.zeros(10**6))
     with pytest.raises(DataError, match="compressed"):
         unpack_arrays(read_bytes(path, limits.MAX_ARRAYS_BYTES), path)
-    header = (
-        b"\x93NUMPY\x01\x00v\x00"
-        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117)
-        + b"\n"
-    )
+    about = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117)
+    header = b"\x93NUMPY\x01\x00v\x00" + about + b"\n"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("A.npy", header + bytes(8))
     with pytest.raises(DataError, match="not a valid archive"):

@@ -150,9 +150,8 @@ def test_wild_samples_are_refused_with_their_place(value: float, sample: int) ->
     data = waves()
     data["u4"][1][sample, 1] = value
     found = r"has 1 above 1e\+50" if abs(value) > 1e50 else "is .*"
-    with pytest.raises(
-        DataError, match=rf"Episode 1 of unit u4 \(default\): channel 'v' {found} at sample {sample}[,;]"
-    ):
+    match = rf"Episode 1 of unit u4 \(default\): channel 'v' {found} at sample {sample}[,;]"
+    with pytest.raises(DataError, match=match):
         survey(population(data))
 
 

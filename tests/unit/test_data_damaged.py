@@ -180,10 +180,8 @@ def test_columns_of_another_type(stored: Path, kind: Any) -> None:
         return table.set_column(at, "v", table["v"].cast(kind, safe=False))
 
     rewrite(stored / "a@default.parquet", change)
-    with pytest.raises(
-        DataError,
-        match=r"a@default\.parquet: row group 0 should hold .* as double, found .*\b(halffloat|float|string|int64)",
-    ):
+    match = r"a@default\.parquet: row group 0 should hold .* as double, found .*\b(halffloat|float|string|int64)"
+    with pytest.raises(DataError, match=match):
         scan_digests(read_parquet(stored))
 
 

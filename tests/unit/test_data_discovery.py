@@ -13,7 +13,6 @@ from kros.core.errors import DataError
 from kros.data.discovery.dialect import look_at
 from kros.data.discovery.discover import Wanted, discover
 from kros.data.discovery.filenames import infer_names
-from kros.data.discovery.roles import time_scale
 from kros.data.measures import identifier, kind_of, split_header
 
 UNITS, EPISODES = range(1, 4), range(1, 4)
@@ -152,10 +151,6 @@ def test_names_of_channels_may_stand_in_formulas():
     kinds = {"motor_speed": "velocity", "IstDrehzahl": "velocity", "tau_meas1": "torque", "pos_filt": "position"}
     assert {name: kind_of(name) for name in (*kinds, "foo")} == kinds | {"foo": ""}
     assert kind_of("x", "bar") == "pressure"
-
-
-def test_scale_of_time_without_a_unit():
-    assert [time_scale(step)[0] for step in (0.001, 0.9, 1.0, 2000.0, 1e6)] == [1.0, 1.0, 1e-3, 1e-6, 1e-9]
 
 
 def test_lines_before_the_numbers(tmp_path: Path):

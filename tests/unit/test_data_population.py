@@ -7,7 +7,6 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, split_episodes
-from kros.data.population import natural_key
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("u", Role.INPUT))
 
@@ -16,10 +15,6 @@ def population(counts: dict[tuple[str, str], int]) -> Population:
     rng = np.random.default_rng(0)
     episodes = {EpisodeKey(u, c, str(e)): rng.standard_normal((5, 2)) for (u, c), n in counts.items() for e in range(n)}
     return from_arrays(episodes, CHANNELS, 0.1)
-
-
-def test_natural_order() -> None:
-    assert sorted(["10", "9", "a10", "a9", "010", "b"], key=natural_key) == ["9", "10", "010", "a9", "a10", "b"]
 
 
 def test_keys_select_and_groups_agree() -> None:

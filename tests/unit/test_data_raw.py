@@ -21,15 +21,9 @@ def truth(seed: int, n: int = N) -> np.ndarray:
     time = np.arange(n) * 1e-3
     moving = np.where(np.arange(n) >= 1000, time - 1.0, 0.0)
     target = 36000 * moving**2
-    columns = [
-        time,
-        target - 12.5 + 0.01 * rng.standard_normal(n),
-        72000 * moving + rng.standard_normal(n),
-        rng.standard_normal(n),
-        target,
-        72000 * moving,
-    ]
-    return np.column_stack(columns)
+    position = target - 12.5 + 0.01 * rng.standard_normal(n)
+    velocity, torque = 72000 * moving + rng.standard_normal(n), rng.standard_normal(n)
+    return np.column_stack([time, position, velocity, torque, target, 72000 * moving])
 
 
 def write_file(path: Path, samples: np.ndarray, header: str = HEADER) -> Path:
@@ -61,11 +55,8 @@ def raw(tmp_path: Path) -> Path:
 def test_reads_values_units_and_facts(raw: Path) -> None:
     population = read_motor_drive_raw(raw)
     assert population.sample_period_s == 0.001
-    assert [(u.id, u.group) for u in population.units] == [
-        ("000000", "outliers"),
-        ("000002", "population"),
-        ("001011", "population"),
-    ]
+    groups = {"000000": "outliers", "000002": "population", "001011": "population"}
+    assert {u.id: u.group for u in population.units} == groups
     assert population.conditions == ("load", "noload")
     assert population.states == ("position", "velocity", "current")
     assert population.inputs == ("target_position", "target_velocity")
@@ -75,15 +66,9 @@ def test_reads_values_units_and_facts(raw: Path) -> None:
 
     samples = truth(1)[:-1]  # the last target is not recorded
     offset = np.mean(samples[500:1000, 4] - samples[500:1000, 1])
-    expected = [
-        (samples[:, 1] + offset) * DEG,
-        samples[:, 2] * DEG,
-        samples[:, 3] / 100,
-        samples[:, 4] * DEG,
-        samples[:, 5] * DEG,
-    ]
+    expected = (samples[:, 1:] + [offset, 0, 0, 0, 0]) * [DEG, DEG, 0.01, DEG, DEG]
     values = population.read(EpisodeKey("001011", "noload", "1"))
-    np.testing.assert_allclose(values, np.column_stack(expected)[1000:], rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(values, expected[1000:], rtol=1e-13, atol=1e-15)
 
 
 def test_two_time_stamps_add_up_unless_an_episode_is_in_both(raw: Path) -> None:

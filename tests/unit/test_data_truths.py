@@ -64,9 +64,8 @@ def test_a_csv_mapping_declares_a_truth(tmp_path: Path) -> None:
     rng, rows = np.random.default_rng(1), {}
     for unit in "ab":
         rows[unit] = rng.standard_normal((20, 3))
-        (tmp_path / f"{unit}.csv").write_text(
-            "\n".join(["x,w,u", *(",".join(map(repr, map(float, row))) for row in rows[unit])])
-        )
+        lines = [",".join(map(repr, row)) for row in rows[unit].tolist()]
+        (tmp_path / f"{unit}.csv").write_text("\n".join(["x,w,u", *lines]))
     channel = [
         {"name": "x_true", "role": "truth", "of": "x", "column": "w"},
         {"name": "u", "role": "input", "column": "u"},

@@ -67,18 +67,8 @@ def test_files_as_documented(tmp_path: Path) -> None:
 
 
 def test_any_id_works(tmp_path: Path) -> None:
-    odd = (
-        "000123456789012345678901",
-        "../etc",
-        "a@b",
-        "a%40b",
-        "Größe 5 / links",
-        "x.parquet",
-        "a b",
-        "x" * 300,
-        "x" * 299 + "y",
-        "ß" * 80,
-    )
+    odd = ("000123456789012345678901", "../etc", "a@b", "a%40b", "Größe 5 / links", "x.parquet", "a b")
+    odd += ("x" * 300, "x" * 299 + "y", "ß" * 80)
     write_parquet(population(odd), tmp_path / "out")
     assert_same(read_parquet(tmp_path / "out"), population(odd))
     assert len(list((tmp_path / "out").iterdir())) == 2 * len(odd) + 1
@@ -86,7 +76,8 @@ def test_any_id_works(tmp_path: Path) -> None:
 
 @example(("a@b", "c"), ("a", "b@c"))
 @example(("a" * 300, ""), ("a" * 300 + "b", ""))
-@given(st.tuples(st.text(max_size=300), st.text(max_size=300)), st.tuples(st.text(max_size=300), st.text(max_size=300)))
+@example(("a" * 299 + "c", ""), ("a" * 299 + "b", ""))
+@given(*[st.tuples(*[st.text(max_size=40)] * 2)] * 2)
 def test_file_names_differ_and_are_portable(one: tuple[str, str], other: tuple[str, str]) -> None:
     names = [group_file(*ids) for ids in (one, other)]
     assert (names[0] == names[1]) == (one == other)

@@ -63,10 +63,8 @@ def test_it_is_the_mean_of_the_other_units_at_the_same_sample() -> None:
 def test_inputs_that_differ_are_another_motion() -> None:
     population, _ = recorded({"a": [0, 0, 1], "b": [0, 0, 1], "c": [0, 0, 1]})
     train, test = training(population, 2)
-    with pytest.raises(
-        DataError,
-        match=r"the inputs of held-out .* do not occur in training episodes of two units",
-    ):
+    match = r"the inputs of held-out .* do not occur in training episodes of two units"
+    with pytest.raises(DataError, match=match):
         make_mean_profile(train, (0,), population, test)
     nearly, _ = recorded({"a": [0, 0], "b": [0, 0]}, noise=1e-3)
     train, test = training(nearly, 1)

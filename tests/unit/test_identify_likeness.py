@@ -103,12 +103,3 @@ def test_a_batch_with_spread_and_a_unit_that_is_moved_less_are_not_doubted(motor
     for values in data[motors.unit_ids[2]]:
         values *= share
     assert alerts(motors, data) == ()
-
-
-@pytest.mark.parametrize("resting", [0.0, 1e-20])
-def test_a_channel_that_rests_in_one_unit_or_in_most_has_no_unit_of_measure(resting: float) -> None:
-    moving = np.eye(4)
-    still = np.diag([1.0, resting, 1.0, resting]) ** 2
-    for units in ([moving, moving, moving, still], [moving, still, still, still]):
-        episodes = {unit: {"run": moment} for unit, moment in zip("abcd", units, strict=True)}
-        assert unlike(["position", "brake"], episodes) == []

@@ -59,10 +59,6 @@ def test_kmeans_finds_separate_clusters_in_any_units():
     np.testing.assert_array_equal(found, kmeans_centres(data, 3, 0))
 
 
-def test_delays():
-    assert delays(["position", "voltage"], 2) == ("position[-1]", "voltage[-1]", "position[-2]", "voltage[-2]")
-
-
 def clustered(names=("a",), n=3, seed=0):
     return {"kind": "radial", "names": names, "centres": {"kind": "kmeans", "n": n, "seed": seed}, "length": 1}
 

@@ -52,11 +52,6 @@ def test_everything_else_is_refused(text):
         parse(text, NAMES)
 
 
-def test_error_names_what_is_known():
-    with pytest.raises(ConfigError, match=r"unknown name 'speed'; known are position, velocity, phase and pi"):
-        parse("sin(speed)", NAMES)
-
-
 def test_separation_rebuilds_the_lifting_for_any_phase():
     lifting = Lifting(
         ("position", "velocity"),

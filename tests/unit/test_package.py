@@ -50,7 +50,6 @@ def test_dir_promises_only_what_exists() -> None:
 
 
 def test_unknown_attribute_names_what_there_is() -> None:
-    with pytest.raises(
-        AttributeError, match=r"Asked for kros\.observers; there are the functions identify, .*observer"
-    ):
+    match = r"Asked for kros\.observers; there are the functions identify, .*observer"
+    with pytest.raises(AttributeError, match=match):
         _ = kros.observers

@@ -50,13 +50,7 @@ NAMES: dict[str, Any] = {"states": ["x", "v"], "inputs": ["u"], "measured": ["x"
 
 
 def test_names_in_place_of_channels() -> None:
-    by_name = dict(
-        zip(
-            ("u", "v", "x", "temperature"),
-            (values(0)[:, 2], values(0)[:, 1], values(0)[:, 0], values(1)[:, 0]),
-            strict=True,
-        )
-    )
+    by_name = dict(zip("xvu", values(0).T, strict=True)) | {"temperature": values(1)[:, 0]}
     for data in ({"a": [by_name]}, {"a": {"default": [by_name]}}, {"a": [values(0)]}):
         population = kros.from_arrays(data, **NAMES)
         assert (population.states, population.inputs, population.measured) == (("x", "v"), ("u",), ("x",))
@@ -99,14 +93,11 @@ def test_arrays_that_do_not_fit(episode: Any, message: str) -> None:
 
 def frame(**changes: Any) -> Any:
     pd = pytest.importorskip("pandas")
-    rows = []
-    for i, (unit, condition, episode) in enumerate([("a", "hot", 2), ("a", "hot", 10), ("b", "hot", 2)]):
-        rows.append(
-            pd.DataFrame(values(i), columns=["x", "v", "u"]).assign(
-                unit=unit, condition=condition, episode=episode, t=np.arange(12) * 0.1
-            )
-        )
-    return pd.concat(rows, ignore_index=True).assign(**changes)
+    rows = [
+        pd.DataFrame(values(i), columns=["x", "v", "u"]).assign(unit=unit, episode=episode, t=np.arange(12) * 0.1)
+        for i, (unit, episode) in enumerate([("a", 2), ("a", 10), ("b", 2)])
+    ]
+    return pd.concat(rows, ignore_index=True).assign(condition="hot").assign(**changes)
 
 
 def test_frame_refuses() -> None:

@@ -24,6 +24,9 @@ MAPPING: dict[str, Any] = {
 }
 
 
+X = {"name": "x", "role": "state", "column": "pos"}
+
+
 def samples(seed: int) -> np.ndarray:
     """Columns t, pos, volt."""
     rng = np.random.default_rng(seed)
@@ -129,18 +132,15 @@ def test_another_rate(folder: Path) -> None:
     [
         ({"file": "x"}, r"file: unknown key; did you mean 'files'\? known are .*files, channel, time"),
         (
-            {"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]},
-            r"channel\.0\.measurd: unknown key; did you mean 'measured'\? .* scale, offset, of\.",
+            {"channel": [X | {"measurd": True}]},
+            r"channel\.0\.measurd: unknown key; did you mean 'measured'\? .* offset, of\.",
         ),
-        (
-            {"channel": [{"name": "x", "role": "output", "column": "pos"}]},
-            r"role: input should be 'state', 'input' or 'truth', found 'output'",
-        ),
+        ({"channel": [X | {"role": "output"}]}, r"role: input should be 'state', 'input' or 'truth', found 'output'"),
         ({"channel": []}, r"there is no \[\[channel\]\]"),
         ({"files": "(?P<Unit>.)"}, "files: names the group 'Unit'; known groups are unit, .*, found '[(][?]P<Unit>"),
         (
-            {"channel": [{"name": "x", "role": "state", "column": "a"}, {"name": "y", "role": "input", "column": "a"}]},
-            r"mapping: every channel needs a column of its own, found \['a', 'a'\]",
+            {"channel": [X, X | {"name": "y"}]},
+            r"mapping: every channel needs a column of its own, found \['pos', 'pos'\]",
         ),
         ({"files": "("}, r"files: input is not a regular expression .*, found '\('"),
         ({"time": None}, "one of time and sample_period_s"),

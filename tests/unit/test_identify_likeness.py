@@ -64,6 +64,14 @@ def test_one_mirrored_episode_of_a_unit_is_named_with_its_channel(motors, column
     assert alert == f"{episode}: {name} moves against the other channels, unlike in most; check its sign."
 
 
+def test_one_episode_with_swapped_columns_is_named(motors) -> None:
+    data = copied(motors)
+    swapped = data[motors.unit_ids[1]][1]
+    swapped[:, [1, 2]] = swapped[:, [2, 1]]
+    begin = f"Episode 1 of unit {motors.unit_ids[1]} (default): current moves "
+    assert any(alert.startswith(begin) for alert in alerts(motors, data))
+
+
 def test_a_motion_that_turns_a_correlation_in_every_unit_is_no_mirrored_channel() -> None:
     """One of four episodes is above the resonance: there the force is against the position, in all units but one."""
     t, frequencies = np.arange(400) * 0.05, np.array([0.3, 0.4, 0.5, 3])

@@ -71,19 +71,13 @@ def test_a_grid_search_over_whole_episodes_finds_the_true_lifting() -> None:
     assert abs(1 - search.best_score_) < 1e-12
 
 
-@pytest.mark.parametrize(
-    ("package", "call"),
-    [
-        ("sklearn", "kros.interop.KoopmanRegressor"),
-        ("control", "kros.interop.to_control"),
-    ],
-)
+@pytest.mark.parametrize(("package", "call"), [("sklearn", "KoopmanRegressor"), ("control", "to_control")])
 def test_what_is_not_installed_is_named_when_it_is_needed(package: str, call: str) -> None:
     code = (
         f"import sys; sys.modules[{package!r}] = None\n"
         "import kros, kros.interop\n"
         "from kros.core import MissingDependencyError\n"
-        f"try:\n    {call}\nexcept MissingDependencyError as error:\n    assert {f'kros[{package}]'!r} in str(error)\n"
+        f"try:\n    kros.interop.{call}\nexcept MissingDependencyError as error:\n    assert {f'kros[{package}]'!r} in str(error)\n"
         "else:\n    raise SystemExit('no error')\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

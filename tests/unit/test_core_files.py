@@ -3,6 +3,7 @@
 import json
 import os
 import socket
+import threading
 import zipfile
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kros.core import limits
+from kros.core import artifacts, limits
 from kros.core.artifacts import load_artifact, pack_arrays, read_json, save_artifact, unpack_arrays
 from kros.core.errors import ConfigError, DataError
 from kros.core.files import read_bytes, read_toml, write_bytes
@@ -157,3 +158,23 @@ def test_toml_that_cannot_be_used(tmp_path: Path, content: bytes) -> None:
 def test_names_that_are_not_those_of_files_inside_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is not the name of a file inside it"):
         place(tmp_path, name)
+
+
+def test_what_checks_values_is_not_built_where_interrupts_arrive(monkeypatch):
+    """An interrupt inside the compiled builder is lost, or becomes another error: the main thread only waits."""
+    builders, original = [], artifacts.TypeAdapter
+
+    class Adapter:
+        def __class_getitem__(cls, kind):
+            def build(*args, **options):
+                builders.append(threading.current_thread())
+                return original(*args, **options)
+
+            return build
+
+    monkeypatch.setattr(artifacts, "TypeAdapter", Adapter)
+    artifacts._adapter.cache_clear()
+    assert artifacts.united(tuple[int, float], [3, "inf"], {}) == (3, np.inf)
+    artifacts._adapter.cache_clear()
+    assert len(builders) == 1
+    assert builders[0] is not threading.main_thread()

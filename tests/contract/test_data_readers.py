@@ -98,13 +98,7 @@ def by_frame(folder: Path) -> Population:
     return prepare(from_frame(pd.concat(parts), CHANNELS, sample_period_s=PERIOD), PREPARATION)
 
 
-READERS = {
-    "raw": by_raw,
-    "parquet": by_parquet,
-    "csv": by_csv,
-    "arrays": by_arrays,
-    "frame": by_frame,
-}
+READERS = {"raw": by_raw, "parquet": by_parquet, "csv": by_csv, "arrays": by_arrays, "frame": by_frame}
 
 
 @pytest.mark.parametrize("opened", READERS.values(), ids=READERS.keys())

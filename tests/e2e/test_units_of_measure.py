@@ -18,8 +18,7 @@ from kros.study.config import Stage, validate_config
 
 CHANNELS = ("position", "velocity", "current", "voltage")
 WITHIN = 1e-9
-# Weights of what a form cannot represent are fitted to differences that are known to 1e-7 at low frequencies, and the
-# fit makes 1e-4 of that; nothing else is sensitive. Between two processors 6e-5 was seen.
+# Weights of remainders are fitted to differences, known to 1e-7 at low frequencies; the fit makes 1e-4 of that.
 WEIGHTS, SENSITIVE = "worst_case_h2", 1e-3
 
 

@@ -21,12 +21,7 @@ from kros.plants import DcMotorPopulation, HarmonicDrivePopulation
 CHANNELS = ("position", "velocity", "current", "voltage")
 SCALINGS = [{name: factor} for name in CHANNELS for factor in (1e-9, 1e9)]
 SCALINGS.append({"position": 1e9, "velocity": 1e-9, "current": 1e-9, "voltage": 1e9})
-QUICK = RefineOptions(
-    horizons=(5, 60),
-    strengths=(10.0, 1.0),
-    path_iterations=3,
-    segments=4,
-)
+QUICK = RefineOptions(horizons=(5, 60), strengths=(10.0, 1.0), path_iterations=3, segments=4)
 
 
 @dataclass(frozen=True)

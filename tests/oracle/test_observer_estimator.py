@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 from batches import batch_of, run_with_status
 from machines import filters
 from recorded_plant import DT, FEW, LIFTING, estimator, plant, recorded_motors
@@ -28,7 +29,7 @@ from kros.observer import (
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
-from kros.observer.estimator.gaps import decay
+from kros.observer.estimator.gaps import decay, following
 from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Moments, Readout, Whitening, condition_weights
 from kros.observer.estimator.rows import Design
@@ -525,6 +526,23 @@ def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():
     np.testing.assert_allclose(np.linalg.matrix_power(found, 20), np.linalg.matrix_power(F, 20), atol=0.1)
     apart = np.concatenate([decays[..., 2:], np.cumsum(decays[..., 2:], axis=0)], axis=-1)  # an integrator
     assert np.abs(np.linalg.eigvals(decay(apart, [0]))).max() <= 1.0
+
+
+def test_no_pattern_of_losses_makes_distances_grow():
+    """Two masses, one of them measured: F is stable, and its part for the others is not."""
+    rng, k = np.random.default_rng(0), 40.0
+    A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-2 * k, k, -0.6, 0.3], [k, -k, 0.3, -0.6]])
+    mix, apart = np.eye(4) + 0.5 * rng.normal(size=(4, 4)), np.zeros((20_000, 1, 4))
+    F = mix @ scipy.linalg.expm(0.05 * A) @ np.linalg.inv(mix)
+    for k in range(len(apart) - 1):
+        apart[k + 1] = apart[k] @ F.T + rng.normal(size=4)
+    rms, largest = np.sqrt((apart**2).mean(axis=(0, 1))), []
+    for pull in (following(F, apart, rms, [0])[:, 0], np.eye(4)[0]):
+        distances = [rms]
+        for arrives in rng.random(900) < np.repeat([0.1, 0.5, 0.9], 300):
+            distances.append(F @ (distances[-1] - pull * distances[-1][0] * arrives))
+        largest.append(np.abs(distances / rms).max())
+    assert largest[0] < 10 < 1e3 < largest[1]
 
 
 def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():

@@ -12,14 +12,7 @@ from kros.core.lti import StateSpace, gain
 from kros.data.population import EpisodeKey
 from kros.design.baselines import Baseline
 from kros.lifting import Lifting
-from kros.observer import (
-    Observer,
-    Runtime,
-    SampleStatus,
-    Seen,
-    relift_certificate,
-    run_observer,
-)
+from kros.observer import Observer, Runtime, SampleStatus, Seen, relift_certificate, run_observer
 from kros.observer.baselines.difference import FilteredDifference
 from kros.observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from kros.observer.certificate.error import error_system

@@ -280,6 +280,12 @@ def test_one_clock_that_runs_back_hides_time_in_no_other_file(tmp_path: Path, ba
     assert [text.partition(":")[0] for text in found.findings] == [f"left out, {name}"]
 
 
+@pytest.mark.parametrize("stamp", ["2026-03-04T07:12:0{}Z", "2026-03-04T07:12:0{}+01:00", "04.03.2026 07:12:0{}"])
+def test_stamps_with_and_without_a_zone_are_time(tmp_path: Path, stamp: str):
+    (tmp_path / "a.csv").write_text("\n".join(["time,pos,u", *(f"{stamp.format(k)},{k}.5,1" for k in range(9))]))
+    assert look_at(tmp_path / "a.csv").timestamp(0) == ("dmy" if stamp[2] == "." else "ymd")
+
+
 def test_rows_that_repeat_are_dropped_and_stamps_that_repeat_need_a_period(tmp_path: Path):
     """Every tenth row twice; then stamps of which one in two hundred is that of the sample before."""
     doubled = {

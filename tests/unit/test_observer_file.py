@@ -124,7 +124,7 @@ def filters(**changes: Any) -> Observer:
     lifting = Lifting(("position", "filter_1", *own), (), (), ("torque",), ("1",))
     ages = ("half", "recovery", "reach", "start_recovery", "gate")
     bank = {"filters": 1, "start": np.ones((5, 7)), **dict.fromkeys(ages, np.ones(1))}
-    bank |= {**dict.fromkeys(ages[:2], np.ones((1, 1))), "start_recovery": np.array([0.9, 0.5])}
+    bank |= dict.fromkeys((*ages[:2], "pull"), np.ones((1, 1))) | {"start_recovery": np.array([0.9, 0.5])}
     none, made = gain(np.zeros((5, 1)), 0.01), FilterBank(**bank | changes)
     return Observer(
         "f", lifting, 0.5 * np.eye(5), np.ones((5, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=made

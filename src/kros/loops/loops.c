@@ -63,6 +63,7 @@ typedef struct {
     double *past;             /* (batch, earlier), moved on */
     const double *reach;      /* (recorded) */
     const double *gate;       /* (q) */
+    const double *pull;       /* (recorded, q) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
     const double *bank;       /* (3 kinds + 1, recorded, batch): half, recovery, longest age, recovery of a start */
     double *gap;              /* (kinds recorded + 2 q + 2 + q filters, batch): age, counts of missing and of refused, ages of the start and of a loss, ramps; moved on */
@@ -284,6 +285,12 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
             reg[i] = y[row] = either(lost, held + near, seen);
         }
     }
+    vec innovation[s->q * MOST];
+    for (whole j = 0; j < s->q; j++)
+        for (whole v = 0; v < w; v++) {
+            const whole at = s->measured[j] * MOST + v;
+            innovation[j * MOST + v] = reg[at] - from_inputs[at] - offset[at];
+        }
     for (whole i = 0; i < recorded; i++)
         for (whole v = 0; v < w; v++) {
             const whole at = i * MOST + v;
@@ -294,7 +301,9 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
                 hidden &= s->measured[j] != i;
             }
             const vec share = either(lost, (vec){0}, 1.0 - hidden * counted(s, bank, gap, at));
-            const vec moved = offset[at] + share * (reg[at] - from_inputs[at] - offset[at]);
+            vec pulled = offset[at];
+            for (whole j = 0; j < s->q; j++) pulled += s->pull[i * s->q + j] * either(lost, (vec){0}, innovation[j * MOST + v]);
+            const vec moved = pulled + share * (reg[at] - from_inputs[at] - pulled);
             const double most = hidden ? s->reach[i] : INFINITY;
             offset[at] = clipped(moved, (vec){0} - most, (vec){0} + most);
         }

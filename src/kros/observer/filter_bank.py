@@ -8,9 +8,11 @@ internal states are the filters z of measurements and inputs, whose estimate is 
 .. math:: o_k \leftarrow o_k + (1 - m) (x_k - x^u_k - o_k), \qquad o_{k+1} = F o_k,
 
 where m is zero for measurements, and one for all states while a measurement is missing: estimates that follow from
-substitutes do not enter what substitutes follow from, and F is stable as a whole. So the fallback :math:`x^u + o`
-continues the last estimate and tends to :math:`x^u`; estimates in which the fallback counts already change it less,
-since they say little. The age a of a gap is the number of samples that are missing so far; when measurements return it
+substitutes do not enter what substitutes follow from. So the fallback :math:`x^u + o` continues the last estimate and
+tends to :math:`x^u`; estimates in which the fallback counts already change it less, since they say little. Before that,
+measurements that have all arrived pull o by :math:`L (y - x^u - o)`, with L the regression of distances on those of
+measurements by a covariance X. As :math:`F X F' \le X`, F and :math:`I - L C` are contractions in one norm: no pattern of
+losses makes o grow. The age a of a gap is the number of samples that are missing so far; when measurements return it
 falls by a factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own :math:`\mu`:
 a state that is estimated from slow filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m
 is below one percent after five time constants of :math:`\mu`. Of several measurements, gaps of all and gaps of some
@@ -58,10 +60,11 @@ class FilterBank:
     reach: Array
     start_recovery: Array
     gate: Array
+    pull: Array  # (n, q)
 
     def __post_init__(self) -> None:
         kinds = {"start": "finite numbers", "half": "positive and finite", "reach": "finite and not negative"}
-        kinds["gate"] = "positive"
+        kinds |= {"gate": "positive", "pull": "finite numbers"}
         shares = dict.fromkeys(("recovery", "start_recovery"), "shares between 0 and 1")
         floats(self, "Filter bank", **shares, **kinds)
 
@@ -156,8 +159,11 @@ class Gaps:
             y = np.where(missing, expected, y)
         x[:, self.measured] = y
         share[:, self.measured] = 0.0
-        share[missing.any(axis=1)] = 1.0
-        offset += (1 - share) * (recorded - x[:, self.from_inputs] - offset)
+        some = np.asarray(missing.any(axis=1))
+        share[some] = 1.0
+        distance = recorded - x[:, self.from_inputs]
+        offset += np.where(some[:, None], 0.0, (distance - offset)[:, self.measured]) @ self.bank.pull.T
+        offset += (1 - share) * (distance - offset)
         np.clip(offset, -self._most, self._most, out=offset)
 
     def follow(self, following: Array, missing: Flags, slopes: Array | None) -> None:
@@ -201,6 +207,7 @@ class Gaps:
             "filters": bank.filters,
             "reach": bank.reach,
             "gate": bank.gate,
+            "pull": bank.pull,
             "patience": bank.patience,
             "limits": np.array(self.limits),
             "bank": np.repeat(rows[..., None], self.state.shape[1], axis=-1),

@@ -35,6 +35,7 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
             "start": x[: lifting.n_states, None] / np.concatenate([x, u]),
             "reach": x[: len(observer.recorded)],
             "gate": y,
+            "pull": x[: len(observer.recorded), None] / y,
         },
         "guard": dict.fromkeys(("lower", "upper"), x[: lifting.n_states]),
         "runtime": dict.fromkeys(observer.runtime.by_state(), x[: lifting.n_states]),

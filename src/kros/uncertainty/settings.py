@@ -71,7 +71,7 @@ class MagnitudeRule:
     edge: float = 1e-4  # share to which n and d may fall between the ends of the grid and DC or Nyquist
     below: float = 10.0  # weight of the distance to the data in a program: it keeps fits of one ratio near them
     settled: float = 1 - ITERATED  # ratio of steps of Dinkelbach's iteration that ends it
-    room: float = 1e-5  # above the least ratio; the first step within it is taken: nearer ones hang on rounding
+    room: float = 1e-5  # by which a step has to lower the ratio to be taken: what is nearer hangs on rounding
     damping: float = 3e-3  # least, of a pair of zeros or poles
     widest: float = 40.0  # y of a pair: two real ones 17 decades apart
 

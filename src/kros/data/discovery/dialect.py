@@ -18,7 +18,7 @@ from .examine import RULE
 
 MARKS = [tuple(marks) for marks in (";,", ";.", "\t,", "\t.", ",.", "|.", "|,", " .", " ,")]  # delimiter, decimal point
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
-_CLOCK = re.compile(r"^(?:\d+[-./]\d+[-./]\d+[T ]\s*)?\d{1,2}:\d{2}:\d{2}\b")
+_CLOCK = re.compile(r"^(?:\d+[-./]\d+[-./]\d+[T ]\s*)?\d{1,2}:\d{2}:\d{2}(?:Z|\b)")
 _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
 _NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
 

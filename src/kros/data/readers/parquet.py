@@ -52,8 +52,7 @@ class ParquetRecordings(Recordings):
 
         place = self.places[key]
         path, (_, group, samples) = self.file(place), place
-        options: Record = {"pre_buffer": False, "page_checksum_verification": True, "memory_map": True}
-        options["read_dictionary"] = list(KEYS)
+        options: Record = dict.fromkeys(("page_checksum_verification", "memory_map"), True) | {"read_dictionary": KEYS}
         require_regular(path, sys.maxsize)
         try:
             with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:

@@ -96,14 +96,16 @@ def identify_estimator(
 
     filters, fallback = reduced(readout, settings.order), fallback_of(blind, settings.order)
     observer, orders = observer_of(filters, fallback), (len(filters.A), len(fallback.A))
-    F, apart, gate = distances(observer, recordings, settings, held)
+    F, pull, apart, gate = distances(observer, recordings, settings, held)
     near = [i for i in measured if i not in held]
 
     def complete(one: Observer) -> Observer:
         assert one.bank is not None
         reach = one.bank.reach.copy()
         reach[near] = settings.reach * apart[near]
-        return replace(let_go(one, F), runtime=bounded(one, recordings, settings), bank=replace(one.bank, reach=reach))
+        return replace(
+            let_go(one, F), runtime=bounded(one, recordings, settings), bank=replace(one.bank, reach=reach, pull=pull)
+        )
 
     def trial(group: Group) -> Observer:
         return complete(
@@ -236,7 +238,16 @@ def assembled(
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[:n] for end in design.recordings.ranges)
     ages = np.ones((min(2, len(at)), n))
-    gaps = FilterBank(r, start, ages, np.zeros_like(ages), high - low, np.exp(-5 / fades), np.full(len(at), np.inf))
+    gaps = FilterBank(
+        r,
+        start,
+        ages,
+        np.zeros_like(ages),
+        high - low,
+        np.exp(-5 / fades),
+        np.full(len(at), np.inf),
+        np.zeros((n, len(at))),
+    )
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(

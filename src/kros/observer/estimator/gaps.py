@@ -83,12 +83,13 @@ def with_gaps(
     of all lengths do; trials do not know their recordings. Gaps of all measurements and, of several, gaps of some have
     ages of their own. Measured states have none: their substitutes are near the fallback always.
     """
-    n, q = len(F), len(trials[0][0].measured)
-    hidden = [i for i in range(n) if i not in trials[0][0].measured]
+    at = list(trials[0][0].measured)
+    hidden = [i for i in range(len(F)) if i not in at]
     half, recovery = np.full(bank.half.shape, _NEVER), np.zeros(bank.half.shape)
     if not hidden:
         return replace(bank, half=half, recovery=recovery)
-    rng = np.random.default_rng(settings.seed)
+    pull, rng = np.zeros_like(F), np.random.default_rng(settings.seed)
+    pull[:, at] = bank.pull
     longest = settings.longest(float(np.median([recordings.length for _, recordings in trials])))
     ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
@@ -101,15 +102,15 @@ def with_gaps(
         for (trial, _), (states, y, inputs, own) in zip(trials, seen, strict=True):
             lost, sensors = losses(rng, *y.shape[:2]), np.ones(y.shape[1:], dtype=bool)
             if kind:
-                sensors = rng.permuted(np.arange(q) < rng.integers(1, q, (len(sensors), 1)), axis=1)
+                sensors = rng.permuted(np.arange(len(at)) < rng.integers(1, len(at), (len(sensors), 1)), axis=1)
             assert trial.bank is not None
             side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
             shown = np.where(lost[..., None] & sensors, np.nan, y)
             filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
-            filtered[..., list(trial.measured)] = states[..., list(trial.measured)]
+            filtered[..., at] = states[..., at]
             runs.append((states, filtered, from_inputs, lost))
         states, filtered, from_inputs, lost = (np.concatenate(each, axis=1) for each in zip(*runs, strict=True))
-        squares = blended_errors(states, filtered, from_inputs, lost, F, hidden, T, mu)
+        squares = blended_errors(states, filtered, from_inputs, lost, F, pull, hidden, T, mu)
         logs = np.log(np.maximum(squares, TINY))
         errors[kind] = ((logs - logs.min(axis=0)) ** 2).mean(axis=1)
     choice = errors.argmin(axis=1)
@@ -120,8 +121,8 @@ def with_gaps(
 
 def distances(
     observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]
-) -> tuple[Array, Array, Array]:
-    """Return by which matrix distances from estimates of inputs alone decay, their RMS, and the gates of measurements.
+) -> tuple[Array, Array, Array, Array]:
+    """Return how distances from estimates of inputs alone decay and follow measurements, their RMS, and the gates.
 
     States that are `held` have no decay.
     """
@@ -136,7 +137,24 @@ def distances(
     gate = settings.gate * np.where(largest > 0, largest, np.inf)
     F = decay(apart, [i for i in range(n) if i not in at] or at)
     F[held], F[:, held] = 0.0, 0.0
-    return F, np.sqrt(np.mean(apart**2, axis=(0, 1))), gate
+    rms = np.sqrt(np.mean(apart**2, axis=(0, 1)))
+    return F, following(F, apart, rms, at), rms, gate
+
+
+def following(F: Array, apart: Array, rms: Array, measured: list[int]) -> Array:
+    """Return by how much distances (n, q) follow those of measurements: their regression, by a covariance X.
+
+    ``F X F' <= X``, so that F and the correction are contractions in one norm: no order of the two makes them grow.
+    """
+    from scipy.linalg import solve_discrete_lyapunov
+
+    size = np.where(rms > 0, rms, 1.0)
+    one, step = (apart / size).reshape(-1, len(F)), F * size / size[:, None]
+    now = one.T @ one / len(one)
+    values, modes = np.linalg.eigh(now - step @ now @ step.T)
+    X = solve_discrete_lyapunov(step, (modes * np.maximum(values, 0.0)) @ modes.T)
+    pull = X[:, measured] @ np.linalg.pinv(X[np.ix_(measured, measured)], hermitian=True)
+    return pull * size[:, None] / size[measured]
 
 
 def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Parameters) -> Array:
@@ -153,6 +171,7 @@ def blended_errors(
     from_inputs: Array,
     missing: Flags,
     F: Array,
+    pull: Array,
     judged: Sequence[int],
     half: Array,
     recovery: Array,
@@ -164,6 +183,7 @@ def blended_errors(
     offset, blend = x - from_inputs[0], np.zeros((*age.shape, 1))
     for k, lost in enumerate(missing[:-1]):
         share = np.where(lost[:, None], 1.0, fading * blend)
+        offset = offset + (~lost[:, None] * (x - from_inputs[k] - offset)) @ pull.T
         offset = (offset + (1 - share) * (x - from_inputs[k] - offset)) @ F.T
         count = np.where(lost, count + 1, 0.0)
         age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)

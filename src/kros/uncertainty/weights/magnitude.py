@@ -182,22 +182,22 @@ def _dinkelbach(
     """Return the bound of the smallest ratio below gamma, and that; n and d do not fall at DC, Nyquist and cuts."""
     phi, edges = basis(tau, knots), np.concatenate([[0.0], cuts, [np.inf]])
     edge = basis(edges, knots) - MAGNITUDE.edge * phi[np.searchsorted(tau, edges).clip(max=len(tau) - 1)]
-    found, scale = list[tuple[RationalMagnitude | None, float]](), targets**-0.5  # n and d share the slope
+    best, least, scale = None, np.inf, targets**-0.5  # n and d share the slope
     while True:
         try:
             a, b = _program(phi / scale[:, None], targets, edge, gamma)
         except (RuntimeError, np.linalg.LinAlgError):  # no solution in as many steps as nnls takes, or no unique one
-            break
+            return best, least
         n, d = phi @ a, phi @ b
         if not ((d > 0) & (n > 0)).all():
-            break
+            return best, least
         ratio = n / (targets * d)
         spread = float(ratio.max() / ratio.min())
         if spread >= gamma * MAGNITUDE.settled:
-            break
+            return best, least
+        if spread * (1 + MAGNITUDE.room) < least:
+            best, least = RationalMagnitude(a / ratio.min(), b, knots), spread
         gamma, scale = spread, d
-        found.append((RationalMagnitude(a / ratio.min(), b, knots), spread))
-    return next((one for one in found if one[1] <= gamma * (1 + MAGNITUDE.room)), (None, gamma))
 
 
 def _program(phi: AnyArray, targets: AnyArray, edge: AnyArray, gamma: float) -> list[AnyArray]:

@@ -104,6 +104,8 @@ def test_a_rival_that_is_better_in_one_hidden_state_is_named_with_the_state() ->
     texts = [r.text for r in judge(Facts(metrics(evaluation=rows))).reasons if "smaller errors" in r.text]
     better = {"learned": "velocity", "linear, mixed H2-H∞": "force"}
     assert texts == [f"“{name}” has smaller errors of {state}." for name, state in better.items()]
+    loaded = metrics(evaluation=[r | {"condition": "load"} for r in rows], study={"identify_on": "load"})
+    assert any("smaller errors of force, loaded." in r.text for r in judge(Facts(loaded)).reasons)
 
 
 def test_a_bound_that_a_unit_exceeds_says_so_where_it_stands() -> None:

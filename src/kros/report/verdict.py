@@ -219,7 +219,8 @@ def _of_errors(facts: Facts) -> Checks:
         designed = "relift_certified" in facts.observers.get(name, {})
         export = f"`kros export c --observer {name}` exports it."
         action = export if designed else "It is a baseline that is not exported."
-        text = f"“{observer_label(name)}” has smaller errors {where}{_where_lost(facts, name)}."
+        condition = in_condition(facts.table.condition)
+        text = f"“{observer_label(name)}” has smaller errors {where}{condition}{_where_lost(facts, name)}."
         yield text, f"Compare both. {action}", "errors"
     same = not_improved(facts)
     if 0 < len(same) < len(hidden):

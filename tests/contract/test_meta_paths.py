@@ -27,13 +27,8 @@ from kros.uncertainty.quantify import UncertainModels
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 SAMPLES = 1009  # of the recording; nothing else has as many rows
-FEW = {
-    "rows": 3000,
-    "sample": 1000,
-    "folds": 2,
-    "parts": 2,
-    "gap_samples": 300,
-}  # of the estimator, which goes the same way with more
+# Of the estimator, which goes the same way with more.
+FEW = {"rows": 3000, "sample": 1000, "folds": 2, "parts": 2, "gap_samples": 300}
 MOST = {"recording": 7, "worst_case_h2": 6, "estimator": 6}  # packages on a way
 
 

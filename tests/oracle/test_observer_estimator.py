@@ -29,7 +29,7 @@ from kros.observer import (
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
-from kros.observer.estimator.gaps import decay, following
+from kros.observer.estimator.gaps import decay, pull_of
 from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Moments, Readout, Whitening, condition_weights
 from kros.observer.estimator.rows import Design
@@ -528,7 +528,7 @@ def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():
     assert np.abs(np.linalg.eigvals(decay(apart, [0]))).max() <= 1.0
 
 
-def test_no_pattern_of_losses_makes_distances_grow():
+def test_no_order_of_decay_and_correction_makes_distances_grow():
     """Two masses, one of them measured: F is stable, and its part for the others is not."""
     rng, k = np.random.default_rng(0), 40.0
     A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-2 * k, k, -0.6, 0.3], [k, -k, 0.3, -0.6]])
@@ -537,7 +537,7 @@ def test_no_pattern_of_losses_makes_distances_grow():
     for k in range(len(apart) - 1):
         apart[k + 1] = apart[k] @ F.T + rng.normal(size=4)
     rms, largest = np.sqrt((apart**2).mean(axis=(0, 1))), []
-    for pull in (following(F, apart, rms, [0])[:, 0], np.eye(4)[0]):
+    for pull in (pull_of(F, apart, rms, [0])[:, 0], np.eye(4)[0]):
         distances = [rms]
         for arrives in rng.random(900) < np.repeat([0.1, 0.5, 0.9], 300):
             distances.append(F @ (distances[-1] - pull * distances[-1][0] * arrives))

@@ -11,8 +11,8 @@ where m is zero for measurements, and one for all states while a measurement is 
 substitutes do not enter what substitutes follow from. So the fallback :math:`x^u + o` continues the last estimate and
 tends to :math:`x^u`; estimates in which the fallback counts already change it less, since they say little. Before that,
 measurements that have all arrived pull o by :math:`L (y - x^u - o)`, with L the regression of distances on those of
-measurements by a covariance X. As :math:`F X F' \le X`, F and :math:`I - L C` are contractions in one norm: no pattern
-of losses makes o grow. The age a of a gap is the number of samples that are missing so far; when measurements return it
+measurements by a covariance X. As :math:`F X F' \le X`, F and :math:`I - L C` are contractions in one norm: by turns,
+they let no o grow. The age a of a gap is the number of samples that are missing so far; when measurements return it
 falls by a factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own :math:`\mu`:
 a state that is estimated from slow filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m
 is below one percent after five time constants of :math:`\mu`. Of several measurements, gaps of all and gaps of some

@@ -138,13 +138,13 @@ def distances(
     F = decay(apart, [i for i in range(n) if i not in at] or at)
     F[held], F[:, held] = 0.0, 0.0
     rms = np.sqrt(np.mean(apart**2, axis=(0, 1)))
-    return F, following(F, apart, rms, at), rms, gate
+    return F, pull_of(F, apart, rms, at), rms, gate
 
 
-def following(F: Array, apart: Array, rms: Array, measured: list[int]) -> Array:
-    """Return by how much distances (n, q) follow those of measurements: their regression, by a covariance X.
+def pull_of(F: Array, apart: Array, rms: Array, measured: list[int]) -> Array:
+    """Return by how much distances follow those of measurements, (n, q): their regression, by a covariance X.
 
-    ``F X F' <= X``, so that F and the correction are contractions in one norm: no order of the two makes them grow.
+    ``F X F' <= X``, so that F and the correction are contractions in one norm: by turns, they let no distance grow.
     """
     from scipy.linalg import solve_discrete_lyapunov
 

@@ -23,7 +23,18 @@ from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine
 from .filenames import infer_names, quoted
-from .roles import UNKNOWN, ColumnPart, Samples, TableColumn, describe, label_columns, propose, time_columns, time_scale
+from .roles import (
+    COMMAND,
+    UNKNOWN,
+    ColumnPart,
+    Samples,
+    TableColumn,
+    describe,
+    label_columns,
+    propose,
+    time_columns,
+    time_scale,
+)
 
 
 @dataclass(frozen=True)
@@ -49,9 +60,8 @@ class Discovery:
     reading: str = ""  # what the first file was taken for
 
 
-def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None, fewest: int = 0) -> Discovery:
+def discover(source: Path, wanted: Wanted = Wanted(), work: Work | None = None, fewest: int = 0) -> Discovery:
     """Describe a folder of tables; an episode needs at least the `fewest` samples."""
-    wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
     pattern, other = infer_names(list(alike))
     if wanted.files is None and other is not None:
@@ -222,8 +232,8 @@ def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn
 def _doubted(columns: Sequence[TableColumn], time_scale: float, notes: Mapping[str, str]) -> list[str]:
     """Return sentences about a guessed unit of time other than seconds, and about columns that are left out."""
     guess = [f"time_scale = {time_scale:g}: {notes['time_scale']}"] if time_scale != 1 else []
-    if unknown := [c for c in columns if c.part is ColumnPart.LEFT_OUT and c.why == UNKNOWN]:
-        guess.append(f"columns that move, not recognised, left out: {_names(unknown)}; name an --input or --measured")
+    if unknown := [c for c in columns if c.part is ColumnPart.LEFT_OUT and c.why in (COMMAND, UNKNOWN)]:
+        guess.append(f"columns that move, left out: {_names(unknown)}; name an --input or --measured")
     return guess
 
 

@@ -13,6 +13,7 @@ from ..readers.parquet import KEYS
 from ..readers.tables import Table, stretches
 
 UNKNOWN = "not recognised"
+COMMAND = "a command or a voltage, by name and unit"
 Samples = Mapping[int, Sequence[Array]]  # of columns by their place, from several episodes
 _STATES = ["angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration"]
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
@@ -135,7 +136,7 @@ def _spare(column: TableColumn, signals: Sequence[Array]) -> str:
 def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
     """Return the part that the name and the unit of measure of a column speak for, and why."""
     if "input" in words_of(split_header(column.header)[0]) or column.kind == "voltage":
-        return ColumnPart.INPUT, "a command or a voltage, by name and unit"
+        return ColumnPart.INPUT, COMMAND
     if column.kind in _STATES:
         return ColumnPart.STATE, f"{column.kind}, by name or unit"
     return ColumnPart.LEFT_OUT, UNKNOWN

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core import Array, ArrayLike, frozen
 from ...lifting import Lifting
+from ...lifting.formula import Formula
 from .settings import EstimatorSettings
 
 Ranges = Mapping[str, tuple[float, float]]  # of measured states and inputs in training, in the recordings' units
@@ -101,7 +102,7 @@ def channels_of(
     names, nonlinear = [*(lifting.states[i] for i in measured), *inputs], list[str]()
     known = {*names[: len(measured)], *lifting.parameters}
     functions = [f.text for f in lifting.formulas if f.used <= known]
-    functions += [text for f in lifting.formulas if (text := quadrature(f.text, f.used, lifting)) and f.used <= known]
+    functions += [text for f in lifting.formulas if f.used <= known and (text := quadrature(f, lifting.parameters))]
     of_inputs = [f.text for f in lifting.input_formulas if f.used and f.used <= known | set(inputs)]  # no constants
     functions = list(dict.fromkeys(functions))
     linear = len(measured) + len(functions) + len(inputs) + len(of_inputs)
@@ -123,11 +124,11 @@ def channels_of(
     return Channels(bare, tuple(measured), len(inputs), reference, linear, len(nonlinear), recent, unbounded=unbounded)
 
 
-def quadrature(text: str, used: frozenset[str], lifting: Lifting) -> str:
+def quadrature(formula: Formula, calibrated: Sequence[str]) -> str:
     """Return the cosine that belongs to a sine of a calibrated angle, or the sine of a cosine."""
-    outer = text.strip().partition("(")[0]
-    if outer in _QUADRATURE and used & set(lifting.parameters) and text.strip().endswith(")"):
-        return _QUADRATURE[outer] + text.strip()[len(outer) :]
+    outer, bracket, angle = formula.text.strip().partition("(")
+    if outer in _QUADRATURE and formula.used & set(calibrated) and angle.endswith(")"):
+        return _QUADRATURE[outer] + bracket + angle
     return ""
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...core import EPS, ROUNDING, AnyArray, Array, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
-from .rows import Design, Group, Recordings, Sample
+from .rows import Design, Group, Recordings, Sample, Triangles
 
 Candidate = tuple[float, float, float]  # penalty, and weights of starts elsewhere and of restarts
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
@@ -67,23 +67,21 @@ class Moments:
         some = last.recordings.some(last.settings.episodes, last.groups)
         places = [last.bank.places(design.bank) for design in designs]
         groups = tuple(dict.fromkeys(last.groups[key] for key in some.keys))
-        count, power = np.zeros(len(groups)), np.zeros((len(groups), len(last.recordings.size)))
-        sizes = [whitening.directions.shape[1] for whitening in whitenings]
-        gram = [np.zeros((len(groups), r, r)) for r in sizes]
-        cross = [np.zeros((len(groups), r, power.shape[1])) for r in sizes]
+        width = len(last.bank)
+        triangles = Triangles(width + len(last.recordings.size))
         for key, rows, targets, weights in last.rows(some, last.settings.rows):
-            g, root = groups.index(last.groups[key]), np.sqrt(weights)[:, None]
-            rows, targets = root * rows, root * targets
-            count[g] += weights.sum()
-            power[g] += (targets**2).sum(axis=0)
-            for whitening, entries, squares, products in zip(whitenings, places, gram, cross, strict=True):
-                white = rows[:, entries] @ whitening.directions
-                squares[g] += white.T @ white
-                products[g] += white.T @ targets
-        for sums in (power, *gram, *cross):
-            sums /= count.reshape(-1, *[1] * (sums.ndim - 1))
-        parts = zip(whitenings, gram, cross, strict=True)
-        return [cls(whitening, groups, G, C, power, count) for whitening, G, C in parts]
+            triangles.add(last.groups[key], np.sqrt(weights)[:, None] * np.hstack([rows, targets]))
+        sums = [triangles.of(group) for group in groups]
+        counts = [np.linalg.norm(each[:, width - 1]) for each in sums]  # the roots: the last entry of a bank is one
+        means = [each / root for each, root in zip(sums, counts, strict=True)]
+        power = np.array([(mean[:, width:] ** 2).sum(axis=0) for mean in means])
+        found = []
+        for whitening, entries in zip(whitenings, places, strict=True):
+            whites = [mean[:, entries] @ whitening.directions for mean in means]
+            gram = np.array([white.T @ white for white in whites])
+            cross = np.array([white.T @ mean[:, width:] for white, mean in zip(whites, means, strict=True)])
+            found.append(cls(whitening, groups, gram, cross, power, np.square(counts)))
+        return found
 
     def of_groups(self, what: str) -> AnyArray:
         """Return fold, condition or part of every group."""

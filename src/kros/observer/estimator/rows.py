@@ -136,16 +136,16 @@ class Triangles:
     """Triangles of QR decompositions of rows (., p) that come in pieces, by their names."""
 
     def __init__(self, columns: int) -> None:
-        self._columns, self._pieces = columns, dict[str, list[Array]]()
+        self._columns, self._pieces = columns, dict[Hashable, list[Array]]()
 
-    def add(self, name: str, rows: Array) -> None:
+    def add(self, name: Hashable, rows: Array) -> None:
         """Add rows; as soon as they are many, their triangle takes their place."""
         pieces = self._pieces.setdefault(name, [])
         pieces.append(rows)
         if sum(map(len, pieces)) > 3 * self._columns:
             pieces[:] = [self.of(name)]
 
-    def of(self, name: str) -> Array:
+    def of(self, name: Hashable) -> Array:
         """Return the triangle of the rows so far; many columns may be zero."""
         rows = np.vstack([np.zeros((1, self._columns)), *self._pieces.get(name, [])])
         used = rows.any(axis=0)

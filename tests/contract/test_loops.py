@@ -65,7 +65,8 @@ def machines_of(count=250, lost=True):
             np.nan
         )  # longer than inputs are held: a new start
     else:
-        y[0], u = 0.0, np.where(np.isfinite(u), u, 0.0)  # all start at the first sample: compiled, gaps too
+        y[0, ::2], y[0, 1::2], u = 0.0, np.nan, np.where(np.isfinite(u), u, 0.0)  # compiled, gaps too
+        y[rng.random(y.shape) < 0.03] += 8.0
     return y, u, np.linspace(-2, 2, MACHINE_COUNT)
 
 

@@ -86,7 +86,7 @@ def filters(functions=GEAR, cut=False, measured=(0,)):
     kinds = len(measured)  # of gaps: of all, and of some
     ages = ([[5.0, 8.0, 2.0], [9.0, 20.0, 7.0]], [[0.8, 0.9, 0.99], [0.9, 0.95, 0.8]])
     ages = *(values[:kinds] for values in ages), [0.05, 0.4, 0.5], [0.95, 0.7], [1.0, 2.0][:kinds]
-    bank = FilterBank(2, start, *map(np.array, ages), np.full((3, kinds), 0.2))
+    bank = FilterBank(2, start, *map(np.array, ages), np.linspace(2.0, 5.0, kinds), np.full((3, kinds), 0.2))
     q = len(measured)
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, q)), np.zeros((p, 0)), np.zeros((p, q)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))

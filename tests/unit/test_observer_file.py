@@ -122,7 +122,7 @@ def filters(**changes: Any) -> Observer:
     """A filter bank of one filter, and no filter of inputs."""
     own = ("position_after_start", "position_from_inputs", "position_offset_from_inputs")
     lifting = Lifting(("position", "filter_1", *own), (), (), ("torque",), ("1",))
-    ages = ("half", "recovery", "reach", "start_recovery", "gate")
+    ages = ("half", "recovery", "reach", "start_recovery", "gate", "opening")
     bank = {"filters": 1, "start": np.ones((5, 7)), **dict.fromkeys(ages, np.ones(1))}
     bank |= dict.fromkeys((*ages[:2], "pull"), np.ones((1, 1))) | {"start_recovery": np.array([0.9, 0.5])}
     none, made = gain(np.zeros((5, 1)), 0.01), FilterBank(**bank | changes)

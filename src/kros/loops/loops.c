@@ -63,10 +63,12 @@ typedef struct {
     double *past;             /* (batch, earlier), moved on */
     const double *reach;      /* (recorded) */
     const double *gate;       /* (q) */
+    const double *opening;    /* (q): what is added to one after a start */
     const double *pull;       /* (recorded, q) */
+    const double *start;      /* (filters, n_lifted + n_inputs) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
     const double *bank;       /* (3 kinds + 1, recorded, batch): half, recovery, longest age, recovery of a start */
-    double *gap;              /* (kinds recorded + 2 q + 2 + q filters, batch): age, counts of missing and of refused, ages of the start and of a loss, ramps; moved on */
+    double *gap;              /* (kinds recorded + 3 q + 2 + q filters, batch): age, counts of missing, refused and believed, ages of the start and of a loss, ramps; moved on */
     double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
 
@@ -238,7 +240,7 @@ static vec clipped(vec value, vec low, vec high)
     return either(value < low, low, either(value > high, high, value));
 }
 
-#define OLDEST (0.1 * exp(5.0)) /* age of a start */
+#define OLDEST (0.1 * exp(5.0)) /* age of a start; twice as much until a sample has all measurements */
 
 static vec level(vec age, vec half)
 {
@@ -249,7 +251,8 @@ static vec level(vec age, vec half)
 /* How much the fallback counts for a state: the most of gaps of all and of some measurements. */
 static vec counted(const relift_job *s, const vec *bank, const vec *gap, whole at)
 {
-    vec most = {0};
+    const vec start = gap[(s->kinds * s->recorded + 3 * s->q) * MOST + at % MOST];
+    vec most = either(start > OLDEST, (vec){0} + 1.0, (vec){0});
     for (whole k = 0; k < s->kinds; k++) {
         const vec share = level(gap[k * s->recorded * MOST + at], bank[k * s->recorded * MOST + at]);
         most = either(share > most, share, most);
@@ -265,24 +268,29 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
     const vec *from_inputs = reg + (n - 2 * recorded) * MOST;
     vec *offset = reg + (n - recorded) * MOST;
     for (whole v = 0; v < w; v++) {
-        vec *start = gap + (ages + 2 * s->q) * MOST + v;
-        const vec begun = 1.0 + *start * *start;
+        vec *start = gap + (ages + 3 * s->q) * MOST + v;
+        mask waits = *start > OLDEST;
         for (whole j = 0; j < s->q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
-            vec *refusals = gap + (ages + s->q) * MOST + row;
-            const vec seen = y[row], count = gap[ages * MOST + row], held = from_inputs[i] + offset[i];
-            const vec reach = (vec){0} + s->reach[s->measured[j]];
-            const vec near = clipped(reg[i] - held, -reach, reach);
-            const vec missed = 1.0 + count - *refusals, far = s->gate[j] * (missed * missed) * (begun * begun), further = far * (1.0 + *refusals);
-            const vec apart = either(seen > reg[i], seen - reg[i], reg[i] - seen);
-            const mask arrived = seen - seen == 0.0, refused = (apart > further) & (*refusals < (double)s->patience);
-            const mask lost = ~arrived | refused, ends = ~lost & (count > 0.0);
-            *start = either(~refused & (apart > far) & (*refusals > 0.0), (vec){0} + OLDEST, *start);
+            vec *refusals = gap + (ages + s->q) * MOST + row, *believed = refusals + s->q * MOST;
+            const vec seen = y[row], missed = 1.0 + gap[ages * MOST + row] - *refusals, apart = either(seen > reg[i], seen - reg[i], reg[i] - seen);
+            const vec close = s->gate[j] * (1.0 + s->opening[j] / (1.0 + *believed)), far = close * (missed * missed);
+            const mask arrived = seen - seen == 0.0, outvoted = (*refusals >= (double)s->patience) | (*refusals >= *believed);
+            const mask refused = (apart > far * (1.0 + *refusals)) & ~outvoted & ~waits, starts = (apart > far) & (*refusals > 0.0) & ~refused & ~waits;
+            *believed = either(~refused & (apart > close), (vec){0}, *believed);
+            *start = either(starts & (outvoted | (*start < OLDEST)), (vec){0} + OLDEST + either(outvoted, (vec){0} + OLDEST, (vec){0}), *start);
             *refusals = either(refused, *refusals + 1.0, either(arrived, (vec){0}, *refusals));
+            missing[row] = ~arrived | refused;
+        }
+        waits = *start > OLDEST;
+        for (whole j = 0; j < s->q; j++) {
+            const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
+            const vec seen = y[row], count = gap[ages * MOST + row], held = from_inputs[i] + offset[i], reach = (vec){0} + s->reach[s->measured[j]];
+            const vec near = clipped(reg[i] - held, -reach, reach);
+            const mask ends = ~missing[row] & ~waits & (count > 0.0);
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
-            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(ages + 2 * s->q + 2 + j * r + l) * MOST + v] * jump;
-            missing[row] = lost;
-            reg[i] = y[row] = either(lost, held + near, seen);
+            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(ages + 3 * s->q + 2 + j * r + l) * MOST + v] * jump;
+            reg[i] = y[row] = either(missing[row], held + near, seen);
         }
     }
     vec innovation[s->q * MOST];
@@ -309,6 +317,25 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
         }
 }
 
+/* Filters start at the first sample that has all measurements. */
+static void restart(const relift_job *s, const formulas *f, vec *gap, vec *reg, vec *first, const mask *missing, whole w)
+{
+    const whole columns = f->n_lifted + f->n_inputs, ages = s->kinds * s->recorded;
+    for (whole v = 0; v < w; v++) {
+        vec *start = gap + (ages + 3 * s->q) * MOST + v;
+        mask begins = *start > OLDEST;
+        for (whole j = 0; j < s->q; j++) begins &= ~missing[j * MOST + v];
+        if (!any(begins)) continue;
+        for (whole i = 0; i < s->filters; i++) {
+            first[i] = (vec){0};
+            for (whole j = 0; j < columns; j++) first[i] += s->start[i * columns + j] * reg[f->lifted[j] * MOST + v];
+        }
+        for (whole i = 0; i < s->filters; i++) reg[(s->recorded + i) * MOST + v] = either(begins, first[i], reg[(s->recorded + i) * MOST + v]);
+        for (whole j = 0; j < s->q; j++) gap[(ages + 2 * s->q + j) * MOST + v] = either(begins, (vec){0}, gap[(ages + 2 * s->q + j) * MOST + v]);
+        *start = either(begins, (vec){0} + OLDEST, *start);
+    }
+}
+
 /* The fallback into the next estimates; ages and ramps move on. */
 static void follow(const formulas *f, const vec *reg, const relift_job *s, const vec *bank, vec *gap, vec *next, const mask *missing, vec *ramp, whole n, whole columns, whole w)
 {
@@ -318,9 +345,10 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
         vec longest = {0}, shortest = (vec){0} + INFINITY;
         for (whole j = 0; j < q; j++) {
             const mask lost = missing[j * MOST + v];
-            vec *count = gap + (ages + j) * MOST + v, *of = gap + (ages + 2 * q + 2 + j * r) * MOST + v;
+            vec *count = gap + (ages + j) * MOST + v, *believed = count + 2 * q * MOST, *of = gap + (ages + 3 * q + 2 + j * r) * MOST + v;
             const int moves = any(lost | (*count > 0.0));
             *count = either(lost, *count + 1.0, (vec){0});
+            *believed += either(lost, (vec){0}, (vec){0} + 1.0);
             longest = either(*count > longest, *count, longest);
             shortest = either(*count < shortest, *count, shortest);
             some |= lost;
@@ -335,10 +363,10 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
             }
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
-        vec *start = gap + (ages + 2 * q) * MOST + v, *loss = start + MOST;
+        vec *start = gap + (ages + 3 * q) * MOST + v, *loss = start + MOST;
         *loss = either(some, (vec){0} + OLDEST, *loss);
         const vec begun = level(either(*start > *loss, *start, *loss), (vec){0} + 1.0);
-        *start *= bank[3 * ages * MOST + v];
+        *start *= either(*start > OLDEST, (vec){0} + 1.0, bank[3 * ages * MOST + v]);
         *loss *= bank[(3 * ages + recorded) * MOST + v];
         for (whole k = 0; k < s->kinds; k++) {
             const mask lost = k ? some : all;
@@ -367,7 +395,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + 2 * q + 2 + q * s->filters : 0;
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + 3 * q + 2 + q * s->filters : 0;
     const whole numbers = (3 * s->kinds + 2) * recorded;
     vec *bank = vectors(numbers), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
@@ -422,6 +450,7 @@ int kros_relift(const formulas *f, const relift_job *s)
             for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
             for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
             evaluate(f, reg, lanes);
+            if (recorded) restart(s, f, gap, reg, next, (const mask *)missing, w);
             if (s->own) product_each(each, columns, column, next, rows, w);
             else product(map, counts, column, next, rows, w);
             shifted(f, reg, older);

@@ -134,8 +134,8 @@ class ObserverData:
             ages = (min(2, q), *recorded)  # of gaps of all measurements and, of several, of some
             shapes = bank.start.shape, bank.half.shape, bank.recovery.shape, bank.reach.shape
             self._require("start, half, recovery and reach", shapes, ((n, rows + columns), ages, ages, recorded))
-            of_gaps = bank.gate.shape, bank.pull.shape, bank.start_recovery.shape
-            self._require("gate, pull and start_recovery", of_gaps, ((q,), (*recorded, q), (2,)))
+            of_gaps = bank.gate.shape, bank.opening.shape, bank.pull.shape, bank.start_recovery.shape
+            self._require("gate, opening, pull and start_recovery", of_gaps, ((q,), (q,), (*recorded, q), (2,)))
             if not 0 <= bank.filters <= (most := n - 4 * recorded[0]) or K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, and of its states at most {most} filters "

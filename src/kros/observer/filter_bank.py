@@ -26,17 +26,19 @@ It falls so that m is below one percent some of the slowest time constants after
 reaches back to a loss. Limits of the estimates hold before the fallback enters them, so that little of what is far away
 is left in long gaps.
 
-A measurement is refused, and counts as missing, where it is further from its estimate than :math:`b (1 + g)^2 (1 + r)
-(1 + a_s^2)^2`. Here b is the gate, g and r are the samples that were missing and refused just before, and :math:`a_s`
-is the age of a start. After as many refused in a row as a start takes samples, any measurement is believed. One that is
-further away than without r is a start: what was known before is of no use then.
+A measurement is refused, and counts as missing, where it is further from its estimate than :math:`b (1 + w / (1 + k))
+(1 + g)^2 (1 + r)`. Here b is the gate, k are the measurements that were believed since a start, and g and r the samples
+that were missing and refused just before. After as many refused in a row as were believed before, or as a start takes,
+any measurement is believed. One that is further away than without r is a start, and k is zero again after one that is
+further away than without g and r. If no more were believed before than refused since, what was known is of no use: at
+the next sample that has all measurements the filters z start again, and those of inputs, their estimate and its
+distance go on; until then inputs alone count. So it is at a start without all measurements.
 
 A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of states that are not
 measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so are they. When a
 measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit ramp was run along,
 through the slopes of lifted functions at what stood for the measurement, and ``z`` is corrected by :math:`r (y - \hat
-y) / (g + 1)` after g samples. At a start without all measurements, inputs alone count until the first sample that has
-them; there the filters z start again, and those of inputs, their estimate and its distance go on.
+y) / (g + 1)` after g samples.
 """
 
 from __future__ import annotations
@@ -60,25 +62,19 @@ class FilterBank:
     reach: Array
     start_recovery: Array
     gate: Array
+    opening: Array  # (q,), w
     pull: Array  # (n, q)
 
     def __post_init__(self) -> None:
-        kinds = {"start": "finite numbers", "half": "positive and finite", "reach": "finite and not negative"}
-        kinds |= {"gate": "positive", "pull": "finite numbers"}
-        shares = dict.fromkeys(("recovery", "start_recovery"), "shares between 0 and 1")
-        floats(self, "Filter bank", **shares, **kinds)
+        floats(self, "Filter bank", start="finite numbers", pull="finite numbers")
+        floats(self, "Filter bank", half="positive and finite", gate="positive")
+        floats(self, "Filter bank", reach="finite and not negative", opening="finite and not negative")
+        floats(self, "Filter bank", recovery="shares between 0 and 1", start_recovery="shares between 0 and 1")
 
     @property
     def patience(self) -> int:
         """Samples that a start takes: after as many refused in a row a measurement is believed."""
         return round(-5 / np.log(self.start_recovery[0]))
-
-    @property
-    def of_measurements(self) -> Flags:
-        """Which states start when all measurements have arrived, (n,): the first ones, z, and the second estimate."""
-        n, recorded = len(self.start), self.half.shape[1]
-        from_last = n - np.arange(n)
-        return (n - from_last < recorded + self.filters) | ((from_last > 2 * recorded) & (from_last <= 3 * recorded))
 
 
 def level(age: Array, half: Array | float = 1.0) -> Array:
@@ -110,13 +106,14 @@ class Gaps:
         self._A = A[self.filters, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
         self._most = np.where(self.hidden, bank.reach, np.inf)
-        self.take(np.zeros((bank.half.size + 2 * q + 2 + q * bank.filters, batch)))
+        self.take(np.zeros((bank.half.size + 3 * q + 2 + q * bank.filters, batch)))
 
     def take(self, state: Array) -> None:
-        """Go on from a state: ages, counts of missing and of refused, ages of a start and of a loss, and ramps."""
+        """Go on from a state: ages; missing, refused, believed samples; ages of a start and of a loss; ramps."""
         n, q = self.bank.half.size, len(self.measured)
         self.state = state
-        age, self.count, self.refusals, self.start, ramp = np.split(state.T, np.cumsum([n, q, q, 2]), axis=1)
+        parts = np.split(state.T, np.cumsum([n, q, q, q, 2]), axis=1)
+        age, self.count, self.refusals, self.believed, self.start, ramp = parts
         self.age = age.reshape(len(age), *self.bank.half.shape)
         self.ramp = ramp.reshape(len(ramp), q, -1).swapaxes(1, 2)
 
@@ -127,7 +124,7 @@ class Gaps:
 
     @property
     def waiting(self) -> Flags:
-        """The machines of which no sample had all measurements."""
+        """The machines whose filters wait for a sample that has all measurements."""
         return self.start[:, 0] > OLDEST
 
     @property
@@ -138,26 +135,25 @@ class Gaps:
     def gated(self, x: Array, y: Array) -> Array:
         """Return measurements (batch, q), NaN in place of those that are too far from their estimates to be true."""
         apart, waiting = abs(y - x[:, self.measured]), self.waiting[:, None]
-        far = self.bank.gate * (1 + self.count - self.refusals) ** 2 * (1 + self.start[:, :1] ** 2) ** 2
-        refused = (apart > far * (1 + self.refusals)) & (self.refusals < self.bank.patience) & ~waiting
-        believed = (apart > far) & (self.refusals > 0) & ~refused & ~waiting
-        self.start[believed.any(axis=1), 0] = OLDEST
+        near = self.bank.gate * (1 + self.bank.opening / (1 + self.believed))
+        far, most = near * (1 + self.count - self.refusals) ** 2, np.minimum(self.bank.patience, self.believed)
+        refused = (apart > far * (1 + self.refusals)) & (self.refusals < most) & ~waiting
+        starts = (apart > far) & (self.refusals > 0) & ~refused & ~waiting
+        self.start[starts.any(axis=1), 0] = OLDEST
+        self.start[(starts & (self.refusals >= most)).any(axis=1), 0] = _WAITING
+        self.believed[(apart > near) & ~refused] = 0.0
         self.refusals[...] = np.where(np.isfinite(y), refused * (self.refusals + 1), self.refusals)
         return np.where(refused, np.nan, y)
 
     def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
         share, recorded, offset = self.share, x[:, : self.recorded], x[:, self.offset]
-        if missing.any() or self.count.any():
-            reach = self.bank.reach[self.measured]
-            held = (x[:, self.from_inputs] + offset)[:, self.measured]
-            expected = held + np.clip(x[:, self.measured] - held, -reach, reach)
-            ends = ~missing & (self.count > 0) & ~self.waiting[:, None]
-            if ends.any():
-                jump = np.where(ends, (np.where(missing, 0.0, y) - expected) / (self.count + 1), 0.0)
-                x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
-            y = np.where(missing, expected, y)
-        x[:, self.measured] = y
+        reach, held = self.bank.reach[self.measured], (x[:, self.from_inputs] + offset)[:, self.measured]
+        expected = held + np.clip(x[:, self.measured] - held, -reach, reach)
+        ends = ~missing & (self.count > 0) & ~self.waiting[:, None]
+        jump = np.where(ends, (y - expected) / (self.count + 1), 0.0)
+        x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
+        x[:, self.measured] = np.where(missing, expected, y)
         share[:, self.measured] = 0.0
         some = np.asarray(missing.any(axis=1))
         share[some] = 1.0
@@ -165,6 +161,13 @@ class Gaps:
         offset += np.where(some[:, None], 0.0, (distance - offset)[:, self.measured]) @ self.bank.pull.T
         offset += (1 - share) * (distance - offset)
         np.clip(offset, -self._most, self._most, out=offset)
+
+    def begin_filters(self, lifted: Array, inputs: Array, missing: Flags) -> None:
+        """Start the filters of measurements of machines that waited for all measurements."""
+        ready = self.waiting & ~missing.any(axis=1)
+        known = np.concatenate([lifted[ready], inputs[ready]], axis=-1)
+        lifted[ready, self.filters] = known @ self.bank.start[self.filters].T
+        self.start[ready, 0], self.believed[ready] = OLDEST, 0.0
 
     def follow(self, following: Array, missing: Flags, slopes: Array | None) -> None:
         """Blend the fallback into the next states (batch, n) and move ages and ramps on.
@@ -193,6 +196,7 @@ class Gaps:
             self.ramp[...] = np.where(missing[:, None], self._A @ self.ramp + slopes * count[:, None], 0.0)
         waiting = self.waiting
         self.count[...], self.start[...] = count, bank.start_recovery * self.start
+        self.believed += ~missing
         self.start[waiting, 0] = _WAITING
 
     @property
@@ -207,6 +211,8 @@ class Gaps:
             "filters": bank.filters,
             "reach": bank.reach,
             "gate": bank.gate,
+            "opening": bank.opening,
+            "start": bank.start[self.filters],
             "pull": bank.pull,
             "patience": bank.patience,
             "limits": np.array(self.limits),

@@ -157,9 +157,8 @@ class Course:
         """Whether machines go on side by side: none starts again, settles, follows or looks far back."""
         steps = self.steps
         far = self.observer.runtime.delay and (self.observer.lifting.history or steps.gaps is not None)
-        waiting = steps.waiting.any() or (steps.gaps is not None and steps.gaps.waiting.any())
         apart = samples.starts.any() or self.settling.any() or np.ptp(self.since)
-        return not (far or waiting or apart or self.loop is not None)
+        return not (far or steps.waiting.any() or apart or self.loop is not None)
 
     def with_past(self, u: Array) -> Array:
         """Return inputs behind those of the last samples."""

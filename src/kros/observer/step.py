@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.arrays import Array, Flags, Index, Parameters, Record
 from .data import ObserverData
-from .filter_bank import OLDEST, Gaps
+from .filter_bank import Gaps
 from .runtime import bounds
 
 
@@ -39,13 +39,6 @@ class Steps:
         if self.gaps is not None:
             self.gaps.begin(rows, ~np.isfinite(y))
 
-    def _begin_filters(self, y: Array, u: Array, machines: Flags) -> None:
-        """Start the filters of measurements of some machines, whose filters of inputs go on."""
-        if self.gaps is not None and machines.any():
-            at = machines[:, None] & self.gaps.bank.of_measurements
-            np.copyto(self.x, self.observer.initial(y, self.values, u), where=at)
-            self.gaps.start[machines, 0] = OLDEST
-
     def earlier(self, u: Array) -> Array:
         """Return the earlier values, (batch, n_earlier); after a start they equal the present ones."""
         if not self.fresh.any():
@@ -62,7 +55,6 @@ class Steps:
         n, missing = self.lifting.n_states, ~np.isfinite(y)
         u = np.broadcast_to(u, (len(self.x), u.shape[-1]))
         if self.gaps is not None:
-            self._begin_filters(y, u, self.gaps.waiting & ~missing.any(axis=1))
             y = self.gaps.gated(self.x, y)
             self.refused[:] = (np.isnan(y) & ~missing).any(axis=1)
             missing = ~np.isfinite(y)
@@ -71,6 +63,8 @@ class Steps:
         delays = self.past.shape[1] > 0
         window = np.concatenate([self.x, self.earlier(u)], axis=-1) if delays else self.x
         theta, inputs = self.lifting.lift(window, self.values), self.lifting.lift_inputs(u, window, self.values)
+        if self.gaps is not None:
+            self.gaps.begin_filters(theta, inputs, missing)
         following = np.concatenate([theta, self.x_c, inputs, y], axis=-1) @ self._map.T
         if self.gaps is not None:
             self.gaps.follow(following[:, :n], missing, self._into_filters(window, u) if missing.any() else None)

@@ -136,7 +136,7 @@ class Source:
             "guard": np.clip([low, high], -self.precision.largest, self.precision.largest),
             "bounds": self.bounds(),
             "longest_age": longest_age,
-            "gate": [] if o.bank is None else np.minimum(o.bank.gate, self.precision.largest),
+            "gate": () if o.bank is None else np.minimum(o.bank.gate, self.precision.largest),
             "OLDEST": OLDEST,
             "ages": 0 if o.bank is None else o.bank.half.size,
             "rule": {"beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},

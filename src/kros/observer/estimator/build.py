@@ -96,16 +96,16 @@ def identify_estimator(
 
     filters, fallback = reduced(readout, settings.order), fallback_of(blind, settings.order)
     observer, orders = observer_of(filters, fallback), (len(filters.A), len(fallback.A))
-    F, pull, apart, gate = distances(observer, recordings, settings, held)
+    F, pull, apart, (gate, opening) = distances(observer, recordings, settings, held)
     near = [i for i in measured if i not in held]
 
     def complete(one: Observer) -> Observer:
         assert one.bank is not None
-        reach = one.bank.reach.copy()
+        A, reach, offset = one.A.copy(), one.bank.reach.copy(), slice(one.lifting.n_states - n, one.lifting.n_states)
         reach[near] = settings.reach * apart[near]
-        return replace(
-            let_go(one, F), runtime=bounded(one, recordings, settings), bank=replace(one.bank, reach=reach, pull=pull)
-        )
+        A[offset, offset] = F
+        bank = replace(one.bank, reach=reach, pull=pull)
+        return replace(one, A=A, runtime=bounded(one, recordings, settings), bank=bank)
 
     def trial(group: Group) -> Observer:
         return complete(
@@ -115,7 +115,7 @@ def identify_estimator(
     trials = [(trial(group), unseen) for group, unseen in readout.left_out_groups()]
     observer = complete(observer)
     assert observer.bank is not None
-    bank = replace(with_gaps(observer.bank, trials, F, settings), gate=gate)
+    bank = replace(with_gaps(observer.bank, trials, F, settings), gate=gate, opening=opening)
     observer, states = replace(observer, bank=bank), lifting.states
 
     def by_state(values: Array) -> dict[str, float]:
@@ -246,6 +246,7 @@ def assembled(
         high - low,
         np.exp(-5 / fades),
         np.full(len(at), np.inf),
+        np.zeros(len(at)),
         np.zeros((n, len(at))),
     )
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
@@ -263,13 +264,6 @@ def assembled(
         own_values,
         bank=gaps,
     )
-
-
-def let_go(observer: Observer, F: Array) -> Observer:
-    """Return an observer whose distance from the estimates of inputs alone decays by F (n, n)."""
-    A, last = observer.A.copy(), slice(observer.lifting.n_states - len(F), observer.lifting.n_states)
-    A[last, last] = F
-    return replace(observer, A=A)
 
 
 def settle_samples(systems: Sequence[Filters], recovery: Array) -> int:

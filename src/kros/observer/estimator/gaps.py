@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import TINY, Array, Flags, Parameters
-from ..filter_bank import OLDEST, FilterBank, level, longest_age
+from ..filter_bank import FilterBank, level, longest_age
 from ..observer import Observer
 from ..simulate import Course
 from .rows import Recordings
@@ -26,12 +26,8 @@ def training(
     count = samples // length
     batches = [recordings.read(key).head(length) for key in recordings.some(count).keys]
     again = np.arange(count) % len(batches)  # every episode is seen with several losses
-    signals = (
-        [b.states for b in batches],
-        [b.measurements(observer.measured, arrived=False) for b in batches],
-        [b.inputs for b in batches],
-    )
-    states, y, inputs = (np.concatenate(parts, axis=1)[:, again] for parts in signals)
+    signals = ((b.states, b.measurements(observer.measured, arrived=False), b.inputs) for b in batches)
+    states, y, inputs = (np.concatenate(parts, axis=1)[:, again] for parts in zip(*signals, strict=True))
     names = batches[0].parameters
     own = observer.own({k: np.concatenate([b.parameters[k] for b in batches])[again] for k in names})
     return states, y, inputs, own
@@ -88,8 +84,7 @@ def with_gaps(
     half, recovery = np.full(bank.half.shape, _NEVER), np.zeros(bank.half.shape)
     if not hidden:
         return replace(bank, half=half, recovery=recovery)
-    pull, rng = np.zeros_like(F), np.random.default_rng(settings.seed)
-    pull[:, at] = bank.pull
+    rng = np.random.default_rng(settings.seed)
     longest = settings.longest(float(np.median([recordings.length for _, recordings in trials])))
     ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
@@ -110,35 +105,39 @@ def with_gaps(
             filtered[..., at] = states[..., at]
             runs.append((states, filtered, from_inputs, lost))
         states, filtered, from_inputs, lost = (np.concatenate(each, axis=1) for each in zip(*runs, strict=True))
-        squares = blended_errors(states, filtered, from_inputs, lost, F, pull, hidden, T, mu)
+        squares = blended_errors(states, filtered, from_inputs, lost, F, bank.pull, at, T, mu)[..., hidden]
         logs = np.log(np.maximum(squares, TINY))
         errors[kind] = ((logs - logs.min(axis=0)) ** 2).mean(axis=1)
     choice = errors.argmin(axis=1)
-    half, recovery = half.copy(), recovery.copy()
     half[:, hidden], recovery[:, hidden] = T[choice, 0], mu[choice, 0]
     return replace(bank, half=half, recovery=recovery)
 
 
 def distances(
     observer: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]
-) -> tuple[Array, Array, Array, Array]:
-    """Return how distances from estimates of inputs alone decay and follow measurements, their RMS, and the gates.
+) -> tuple[Array, Array, Array, tuple[Array, Array]]:
+    """Return how distances from estimates of inputs alone decay and follow measurements, their RMS, and gates.
 
     States that are `held` have no decay.
     """
+    assert observer.bank is not None
     n, at = len(observer.recorded), list(observer.measured)
     states, y, inputs, own = training(
         observer, recordings, settings.gap_samples, settings.gap_episodes, min(recordings.lengths)
     )
-    estimates, from_inputs = np.split(recorded_estimates(observer, y, inputs, own), 2, axis=-1)
-    assert observer.bank is not None
-    apart, age = states - from_inputs, OLDEST * observer.bank.start_recovery[0] ** np.arange(len(y))[:, None, None]
-    largest = (abs(y - estimates[..., at]) / (1 + age**2) ** 2).max(axis=(0, 1))
-    gate = settings.gate * np.where(largest > 0, largest, np.inf)
+    apart = states - recorded_estimates(observer, y, inputs, own)[..., n:]
+    start = min(observer.bank.patience, len(y) // 2)
+    count = len(y) // start
+    shown, inputs = (np.hstack(np.split(v[: count * start], count)) for v in (y, inputs))
+    again = {name: np.tile(values, count) for name, values in own.items()}
+    largest = abs(shown - recorded_estimates(observer, shown, inputs, again)[..., at]).max(axis=1)
+    usual = largest[start // 2 :].max(axis=0)
+    usual[usual == 0] = np.inf
+    opening = ((largest / usual - 1) * np.arange(1, start + 1)[:, None]).max(axis=0, initial=0.0)
     F = decay(apart, [i for i in range(n) if i not in at] or at)
     F[held], F[:, held] = 0.0, 0.0
     rms = np.sqrt(np.mean(apart**2, axis=(0, 1)))
-    return F, pull_of(F, apart, rms, at), rms, gate
+    return F, pull_of(F, apart, rms, at), rms, (settings.gate * usual, opening)
 
 
 def pull_of(F: Array, apart: Array, rms: Array, measured: list[int]) -> Array:
@@ -172,22 +171,22 @@ def blended_errors(
     missing: Flags,
     F: Array,
     pull: Array,
-    judged: Sequence[int],
+    measured: list[int],
     half: Array,
     recovery: Array,
 ) -> Array:
-    """Return mean squared errors (c, batch, judged) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
-    count, age, fading = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1])), np.zeros(len(F), bool)
-    fading[judged] = True
+    """Return mean squared errors (c, batch, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
+    count, age, fading = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1])), np.ones(len(F))
+    fading[measured] = 0.0
     x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros_like(filtered[:1])
     offset, blend = x - from_inputs[0], np.zeros((*age.shape, 1))
     for k, lost in enumerate(missing[:-1]):
         share = np.where(lost[:, None], 1.0, fading * blend)
-        offset = offset + (~lost[:, None] * (x - from_inputs[k] - offset)) @ pull.T
+        offset = offset + (~lost[:, None] * (x - from_inputs[k] - offset))[..., measured] @ pull.T
         offset = (offset + (1 - share) * (x - from_inputs[k] - offset)) @ F.T
         count = np.where(lost, count + 1, 0.0)
         age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)
         blend = level(age, half)[..., None]
         x = filtered[k + 1] + fading * blend * (from_inputs[k + 1] + offset - filtered[k + 1])
         squares = squares + (x - states[k + 1]) ** 2
-    return squares[..., judged] / len(missing)
+    return squares / len(missing)

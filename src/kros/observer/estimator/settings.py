@@ -76,7 +76,7 @@ class EstimatorSettings(Settings):
     )
     settled_share: float = Field(3e-3, gt=0, description="weight of the errors of `restart_share` for all other time")
     gap_share: float = Field(
-        1e-3,
+        1e-4,
         ge=0,
         description="weight of the errors that straight lines over lost measurements make, half of them, for the time "
         "after a start or a loss",

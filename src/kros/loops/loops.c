@@ -269,7 +269,7 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
     vec *offset = reg + (n - recorded) * MOST;
     for (whole v = 0; v < w; v++) {
         vec *start = gap + (ages + 3 * s->q) * MOST + v;
-        mask waits = *start > OLDEST;
+        mask waits = *start > OLDEST, anew = {0}, complete = ~anew;
         for (whole j = 0; j < s->q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
             vec *refusals = gap + (ages + s->q) * MOST + row, *believed = refusals + s->q * MOST;
@@ -278,10 +278,13 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
             const mask arrived = seen - seen == 0.0, outvoted = (*refusals >= (double)s->patience) | (*refusals >= *believed);
             const mask refused = (apart > far * (1.0 + *refusals)) & ~outvoted & ~waits, starts = (apart > far) & (*refusals > 0.0) & ~refused & ~waits;
             *believed = either(~refused & (apart > close), (vec){0}, *believed);
-            *start = either(starts & (outvoted | (*start < OLDEST)), (vec){0} + OLDEST + either(outvoted, (vec){0} + OLDEST, (vec){0}), *start);
+            *start = either(starts, (vec){0} + OLDEST, *start);
+            anew |= starts & outvoted;
             *refusals = either(refused, *refusals + 1.0, either(arrived, (vec){0}, *refusals));
             missing[row] = ~arrived | refused;
+            complete &= ~missing[row];
         }
+        *start = either(anew & complete, (vec){0} + 2.0 * OLDEST, *start);
         waits = *start > OLDEST;
         for (whole j = 0; j < s->q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;

@@ -30,9 +30,9 @@ A measurement is refused, and counts as missing, where it is further from its es
 (1 + g)^2 (1 + r)`. Here b is the gate, k are the measurements that were believed since a start, and g and r the samples
 that were missing and refused just before. After as many refused in a row as were believed before, or as a start takes,
 any measurement is believed. One that is further away than without r is a start, and k is zero again after one that is
-further away than without g and r. If no more were believed before than refused since, what was known is of no use: at
-the next sample that has all measurements the filters z start again, and those of inputs, their estimate and its
-distance go on; until then inputs alone count. So it is at a start without all measurements.
+further away than without g and r. If no more were believed before than refused since, what was known is of no use: the
+filters z start again, if all measurements are there, and those of inputs, their estimate and its distance go on. At a
+start without all measurements, inputs alone count until the first sample that has them; there the filters z start.
 
 A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of states that are not
 measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so are they. When a
@@ -112,8 +112,9 @@ class Gaps:
         """Go on from a state: ages; missing, refused, believed samples; ages of a start and of a loss; ramps."""
         n, q = self.bank.half.size, len(self.measured)
         self.state = state
-        parts = np.split(state.T, np.cumsum([n, q, q, q, 2]), axis=1)
-        age, self.count, self.refusals, self.believed, self.start, ramp = parts
+        age, self.count, self.refusals, self.believed, self.start, ramp = np.split(
+            state.T, np.cumsum([n, q, q, q, 2]), axis=1
+        )
         self.age = age.reshape(len(age), *self.bank.half.shape)
         self.ramp = ramp.reshape(len(ramp), q, -1).swapaxes(1, 2)
 
@@ -140,10 +141,12 @@ class Gaps:
         refused = (apart > far * (1 + self.refusals)) & (self.refusals < most) & ~waiting
         starts = (apart > far) & (self.refusals > 0) & ~refused & ~waiting
         self.start[starts.any(axis=1), 0] = OLDEST
-        self.start[(starts & (self.refusals >= most)).any(axis=1), 0] = _WAITING
+        shown = np.where(refused, np.nan, y)
+        outvoted = (starts & (self.refusals >= most)).any(axis=1) & np.isfinite(shown).all(axis=1)
+        self.start[outvoted, 0] = _WAITING
         self.believed[(apart > near) & ~refused] = 0.0
         self.refusals[...] = np.where(np.isfinite(y), refused * (self.refusals + 1), self.refusals)
-        return np.where(refused, np.nan, y)
+        return shown
 
     def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""

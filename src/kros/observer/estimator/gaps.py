@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...core import TINY, Array, Flags, Parameters
+from ...core.linalg import pieces
 from ..filter_bank import FilterBank, level, longest_age
 from ..observer import Observer
 from ..simulate import Course
@@ -81,7 +82,7 @@ def with_gaps(
     """
     at = list(trials[0][0].measured)
     hidden = [i for i in range(len(F)) if i not in at]
-    half, recovery = np.full(bank.half.shape, _NEVER), np.zeros(bank.half.shape)
+    half, recovery = np.full_like(bank.half, _NEVER), np.zeros_like(bank.half)
     if not hidden:
         return replace(bank, half=half, recovery=recovery)
     rng = np.random.default_rng(settings.seed)
@@ -160,8 +161,7 @@ def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Param
     """Return the estimates of recorded states and those from inputs alone, (n_samples, batch, 2 n)."""
     course, n = Course(observer, y.shape[1], parameters), len(observer.recorded)
     some = [*range(n), *range(-2 * n, -n)]
-    starts = range(0, len(y), _ROWS)
-    return np.concatenate([course.take(y[k : k + _ROWS], u[k : k + _ROWS]).estimates[..., some] for k in starts])
+    return np.concatenate([course.take(y[k], u[k]).estimates[..., some] for k in pieces(len(y), _ROWS)])
 
 
 def blended_errors(

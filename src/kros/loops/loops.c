@@ -63,7 +63,7 @@ typedef struct {
     double *past;             /* (batch, earlier), moved on */
     const double *reach;      /* (recorded) */
     const double *gate;       /* (q) */
-    const double *opening;    /* (q): what is added to one after a start */
+    const double *opening;    /* (q): how much wider gates are after a start */
     const double *pull;       /* (recorded, q) */
     const double *start;      /* (filters, n_lifted + n_inputs) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */

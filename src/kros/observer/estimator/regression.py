@@ -72,15 +72,15 @@ class Moments:
         for key, rows, targets, weights in last.rows(some, last.settings.rows):
             triangles.add(last.groups[key], np.sqrt(weights)[:, None] * np.hstack([rows, targets]))
         sums = [triangles.of(group) for group in groups]
-        counts = [np.linalg.norm(each[:, width - 1]) for each in sums]  # the roots: the last entry of a bank is one
-        means = [each / root for each, root in zip(sums, counts, strict=True)]
+        roots = [np.linalg.norm(each[:, width - 1]) for each in sums]  # of counts: the last entry of a bank is one
+        means = [each / root for each, root in zip(sums, roots, strict=True)]
         power = np.array([(mean[:, width:] ** 2).sum(axis=0) for mean in means])
         found = []
         for whitening, entries in zip(whitenings, places, strict=True):
             whites = [mean[:, entries] @ whitening.directions for mean in means]
             gram = np.array([white.T @ white for white in whites])
             cross = np.array([white.T @ mean[:, width:] for white, mean in zip(whites, means, strict=True)])
-            found.append(cls(whitening, groups, gram, cross, power, np.square(counts)))
+            found.append(cls(whitening, groups, gram, cross, power, np.square(roots)))
         return found
 
     def of_groups(self, what: str) -> AnyArray:

@@ -40,7 +40,7 @@ def test_what_a_study_hands_over_forgets_faults(demo: Path) -> None:
         found = run_observer(observer, y, u, {"phase": phase} if observer.lifting.parameters else None)[..., :n]
         size = np.sqrt(np.mean(found[:, :1] ** 2, axis=0))
         n_states = observer.lifting.n_states
-        recovery = [0.0] if observer.bank is None else observer.bank.recovery.ravel()
+        recovery = [0.0] if observer.bank is None else observer.bank.recovery
         A = error_system(observer).A if observer.bank is None else observer.A[n:n_states, n:n_states]
         radius = max(np.abs(np.linalg.eigvals(A)).max(), *recovery)
         wait = AT + 100 + max(GOOD, int(np.ceil(-5 / np.log(radius))) if radius < 1 else len(y))

@@ -115,8 +115,8 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     made = design(recordings)
     whitening = Whitening.of(made, made.sample())
     (moments,) = Moments.of([made], [whitening])
-    penalty, start, share = 1e-6, 0.2, 0.1
-    (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, start, share)])
+    penalty, start, share, bridge = 1e-6, 0.2, 0.1, 0.05
+    (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, start, share, bridge)])
     parts: dict = {}
     for key, rows, targets, weights in made.rows(recordings, FEW.rows):
         parts.setdefault(made.groups[key], []).append((rows @ whitening.directions, targets, weights))
@@ -126,6 +126,7 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
         X += [F * np.sqrt(w)[:, None] / size for F, _, w in own]
         T += [t * np.sqrt(w)[:, None] / size for _, t, w in own]
     errors = whitening.trust + start * whitening.elsewhere + share * whitening.disturbed
+    errors += bridge * whitening.bridges
     prior = errors + penalty * np.diag(whitening.penalty)
     root = np.linalg.cholesky(prior).T
     stacked = np.vstack([*X, root]), np.vstack([*T, np.zeros((len(root), 3))])
@@ -221,7 +222,7 @@ def test_left_out_errors_are_those_of_penalties_that_other_units_chose():
     )
     (readout,), (moments,) = Readout.of([made]), Moments.of([made], [Whitening.of(made, made.sample())])
     settings, weights = made.settings, condition_weights(moments, made.settings.restart_share)
-    candidates = [(penalty, 0.0, settings.settled_share) for penalty in settings.penalties]
+    candidates = [(penalty, 0.0, settings.settled_share, 0.0) for penalty in settings.penalties]
     others, folds = moments.without(weights, candidates), moments.of_groups("fold")
     errors = np.array([[moments.errors(c)[i] for c in others[g]] for i, g in enumerate(moments.groups)])
     differing = 0
@@ -269,11 +270,12 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
 def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
     observer = exact[0].observer
     assert observer.bank is not None
-    bank = replace(observer.bank, half=np.full((1, 3), 1e12), reach=np.zeros(3), gate=np.full(1, np.inf))
+    bank = replace(observer.bank, half=np.full((2, 3), 1e12), reach=np.zeros(3), gate=np.full(1, np.inf))
     A, B, n = observer.A.copy(), observer.B.copy(), observer.lifting.n_states
     A[n - 6 : n], B[n - 6 : n] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses it linearly
     A[n - 3 : n, n - 3 : n] = np.eye(3)
-    A[n - 9 : n - 6], B[n - 9 : n - 6] = A[:3], B[:3]  # one readout for all time
+    for own in (slice(n - 12, n - 9), slice(n - 9, n - 6)):
+        A[own], B[own] = A[:3], B[:3]  # one readout for all time
     observer = replace(observer, bank=bank, A=A, B=B)
     y, u = np.linspace(0.0, 2.0, 200)[:, None, None], np.zeros((200, 1, 1))
     lost = y.copy()
@@ -330,7 +332,7 @@ def test_a_measurement_that_is_believed_after_refusals_begins_a_start(motors):
     course, y = Course(observer, batch.states.shape[1]), batch.states[..., :1].copy()
     y[200:] += 0.05 * np.abs(y).max()
     course.take(y, batch.inputs)
-    gaps, slow = course.steps.gaps, observer.bank.start_recovery[0]
+    gaps, slow = course.steps.gaps, observer.bank.recovery[1]
     assert (gaps.start[:, 0] > 100 * slow ** len(y)).all()
 
 
@@ -488,22 +490,24 @@ def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well()
 
 
 @pytest.mark.parametrize("gap", [1, 20])
-def test_a_readout_of_its_own_counts_after_every_loss_until_no_delay_reaches_back_to_it(motors, gap):
+def test_readouts_of_their_own_count_after_a_start_and_after_every_loss(motors, gap):
     observer, batch = motors
     y, n = batch.states[..., :1].copy(), observer.lifting.n_states
     y[300 : 300 + gap] = np.nan
-    runs, last = [], 299 + gap
+    runs, last, half = [], 299 + gap, np.array([[0.1, 2.0, 2.0], [1e12, 1e12, 1e12]])
     for factor in (0.0, 1.0):
         A, B = observer.A.copy(), observer.B.copy()
         share = np.array([1.0, factor, factor])[:, None]  # substitutes are the same: the position
-        A[n - 9 : n - 6], B[n - 9 : n - 6] = share * A[:3], share * B[:3]
-        bank = replace(observer.bank, half=np.full((1, 3), 1e12), gate=np.full(1, np.inf))
+        for own in (slice(n - 12, n - 9), slice(n - 9, n - 6)):
+            A[own], B[own] = share * A[:3], share * B[:3]
+        bank = replace(observer.bank, half=half, gate=np.full(1, np.inf))
         one = replace(observer, A=A, B=B, bank=bank)
-        runs.append(run_observer(one, y, batch.inputs)[last + 3 :, :, 1])
-    (slow, fast), oldest = observer.bank.start_recovery, 0.1 * np.exp(5)
-    since = np.arange(2, len(y) - last - 1)[:, None]
-    age = oldest * np.maximum(fast**since, slow ** (since + last))
-    np.testing.assert_allclose(runs[0], runs[1] / (1 + age**2), atol=1e-9 * np.abs(runs[1]).max())
+        runs.append(run_observer(one, y, batch.inputs)[last + 2 :, :, 1])
+    oldest, since = 0.1 * np.exp(5), np.arange(1, len(y) - last - 1)[:, None]
+    fast, slow = observer.bank.recovery
+    loss, start = min(gap / 2, oldest) * fast**since, oldest * slow ** (since + last)
+    wanted = runs[1] / (1 + start**2) / (1 + loss**2)
+    np.testing.assert_allclose(runs[0], wanted, atol=1e-9 * np.abs(runs[1]).max())
 
 
 def test_candidates_are_compared_without_groups_in_which_a_state_rests():
@@ -511,13 +515,13 @@ def test_candidates_are_compared_without_groups_in_which_a_state_rests():
     made = design(recordings, settings=FEW.model_copy(update={"parts": 3}))
     (moments,) = Moments.of([made], [Whitening.of(made, made.sample())])
     parts = moments.of_groups("part")
-    errors = np.zeros((len(parts), 4, 3))
-    errors[:, 2:] = 0.1  # the other penalty is no better
-    errors[parts < 2, 2:, 0] = -60.0  # but where the first state is zero
+    errors = np.zeros((len(parts), 6, 3))
+    errors[:, 3:] = 0.1  # the other penalty is no better
+    errors[parts < 2, 3:, 0] = -60.0  # but where the first state is zero
     resting = replace(moments, power=np.where((parts < 2)[:, None] & (np.arange(3) == 0), 0.0, 1.0))
-    np.testing.assert_array_equal(resting.best(np.exp(errors)), [0, 0, 0, 1, 1, 1])
-    errors[:, 2:] = -0.3
-    np.testing.assert_array_equal(resting.best(np.exp(errors)), [2, 2, 2, 3, 3, 3])
+    np.testing.assert_array_equal(resting.best(np.exp(errors)), np.repeat([0, 1, 2], 3))
+    errors[:, 3:] = -0.3
+    np.testing.assert_array_equal(resting.best(np.exp(errors)), np.repeat([3, 4, 5], 3))
 
 
 def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():
@@ -621,7 +625,7 @@ def test_filters_start_at_the_first_sample_with_all_measurements_and_those_of_in
     wanted, whole = (Course(observer, y.shape[1]).take(y[k:], u[k:]).estimates for k in (30, 0))
     y[:30, :, late] = np.nan
     found = Course(observer, y.shape[1]).take(y, u).estimates
-    filters, inputs = slice(n, n + observer.bank.filters), slice(n + observer.bank.filters, -3 * n)
+    filters, inputs = slice(n, n + observer.bank.filters), slice(n + observer.bank.filters, -4 * n)
     for part, other in ((filters, wanted[1:]), (inputs, whole[31:])):
         scale = np.abs(other[..., part]).max()
         np.testing.assert_allclose(found[31:, :, part], other[..., part], atol=1e-8 * scale)

@@ -65,9 +65,8 @@ MACHINES = {
 def filters(functions=GEAR, cut=False, measured=(0,)):
     """A filter bank with two filters, one of inputs alone, and ages of gaps for every state."""
     parameters = ("phase",) if functions else ()
-    fallback = tuple(
-        f"{name}_{what}" for what in ("after_start", "from_inputs", "offset_from_inputs") for name in STATES
-    )
+    kinds = ("after_start", "after_loss", "from_inputs", "offset_from_inputs")
+    fallback = tuple(f"{name}_{what}" for what in kinds for name in STATES)
     states = (*STATES, "filter_1", "filter_2", "input_filter_1", *fallback)
     lifting = Lifting(states, functions, parameters, ("target", "rate"), ("rate*position", "1"))
     rng, n, p = np.random.default_rng(3), lifting.n_states, lifting.n_lifted
@@ -78,16 +77,16 @@ def filters(functions=GEAR, cut=False, measured=(0,)):
     A[0, 0] += 1.0
     A[5, 5], B[5, [0, 1, 3]] = 0.95, [0.05, 0.01, 0.02]
     A[6:9, [0, 3, 4]] = [[0.9, 0.2, 0.1], [0.0, 0.1, 0.2], [0.1, 0.0, 0.1]]
-    A[9:12, 5], B[9:12, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
-    A[12:15, 12:15] = [[0.99, 0.05, 0.0], [-0.05, 0.9, 0.02], [0.0, 0.1, 0.5]]
+    A[9:12, [0, 3, 4]] = [[0.7, 0.1, 0.1], [0.1, 0.2, 0.1], [0.0, 0.1, 0.3]]
+    A[12:15, 5], B[12:15, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
+    A[15:18, 15:18] = [[0.99, 0.05, 0.0], [-0.05, 0.9, 0.02], [0.0, 0.1, 0.5]]
     start = 0.1 * rng.normal(size=(n, p + 4))
     start[:, others] = 0.0  # states that are not measured are not known
-    start[12:15] = 0.0
-    kinds = len(measured)  # of gaps: of all, and of some
-    ages = ([[5.0, 8.0, 2.0], [9.0, 20.0, 7.0]], [[0.8, 0.9, 0.99], [0.9, 0.95, 0.8]])
-    ages = *(values[:kinds] for values in ages), [0.05, 0.4, 0.5], [0.95, 0.7], [1.0, 2.0][:kinds]
-    bank = FilterBank(2, start, *map(np.array, ages), np.linspace(2.0, 5.0, kinds), np.full((3, kinds), 0.2))
-    q = len(measured)
+    start[15:18] = 0.0
+    q = len(measured)  # ages of losses of all and of some, of the readout after losses and of the fallback
+    half = [[0.1, 2.0, 1.0], [5.0, 8.0, 2.0], [0.2, 1.0, 4.0], [9.0, 20.0, 7.0]]
+    ages = half[: 2 * q], [0.8, 0.95], [0.02, 0.4, 0.5], [1.0, 2.0][:q]
+    bank = FilterBank(2, start, *map(np.array, ages), np.linspace(2.0, 5.0, q), np.full((3, q), 0.2))
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, q)), np.zeros((p, 0)), np.zeros((p, q)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))
     first = np.append([0.4, 0.1, -0.1], np.zeros(n - 3))

@@ -120,23 +120,23 @@ def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> No
 
 def filters(**changes: Any) -> Observer:
     """A filter bank of one filter, and no filter of inputs."""
-    own = ("position_after_start", "position_from_inputs", "position_offset_from_inputs")
-    lifting = Lifting(("position", "filter_1", *own), (), (), ("torque",), ("1",))
-    ages = ("half", "recovery", "reach", "start_recovery", "gate", "opening")
-    bank = {"filters": 1, "start": np.ones((5, 7)), **dict.fromkeys(ages, np.ones(1))}
-    bank |= dict.fromkeys((*ages[:2], "pull"), np.ones((1, 1))) | {"start_recovery": np.array([0.9, 0.5])}
-    none, made = gain(np.zeros((5, 1)), 0.01), FilterBank(**bank | changes)
+    own = ("after_start", "after_loss", "from_inputs", "offset_from_inputs")
+    lifting = Lifting(("position", "filter_1", *(f"position_{what}" for what in own)), (), (), ("torque",), ("1",))
+    ones = dict.fromkeys(("reach", "gate", "opening"), np.ones(1))
+    bank = {"filters": 1, "start": np.ones((6, 8)), "recovery": np.array([0.5, 0.9]), **ones}
+    bank |= {"half": np.ones((2, 1)), "pull": np.ones((1, 1))}
+    none, made = gain(np.zeros((6, 1)), 0.01), FilterBank(**bank | changes)
     return Observer(
-        "f", lifting, 0.5 * np.eye(5), np.ones((5, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=made
+        "f", lifting, 0.5 * np.eye(6), np.ones((6, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=made
     )
 
 
 @pytest.mark.parametrize(
     ("changes", "error", "match"),
     [
-        ({"recovery": np.array([[1.5]])}, DataError, "between 0 and 1"),
-        ({"start_recovery": np.array([0.5])}, DimensionError, "start_recovery"),
-        ({"half": np.zeros((1, 1))}, DataError, "half should be positive"),
+        ({"recovery": np.array([0.5, 1.5])}, DataError, "between 0 and 1"),
+        ({"recovery": np.ones(1)}, DimensionError, "recovery"),
+        ({"half": np.zeros((2, 1))}, DataError, "half should be positive"),
         ({"start": np.ones((2, 7))}, DimensionError, "start"),
         ({"filters": 4}, DimensionError, "at most 1 filters of measurements; found .* 4 filters"),
     ],
@@ -150,4 +150,4 @@ def test_a_filter_bank_that_does_not_fit_is_refused(
 
 def test_a_filter_bank_has_no_correction() -> None:
     with pytest.raises(DimensionError, match="has no correction"):
-        replace(filters(), controller=gain(np.ones((5, 1)), 0.01))
+        replace(filters(), controller=gain(np.ones((6, 1)), 0.01))

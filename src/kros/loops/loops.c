@@ -49,7 +49,7 @@ typedef struct {
     whole own;         /* every machine has a map of its own: map (batch, rows, columns) */
     whole fresh;       /* earlier values equal the present ones at the first sample */
     whole recorded;    /* first states; the last ones are those after a start, those from inputs alone, and how far apart they are; none */
-    whole kinds;       /* of gaps: of all measurements, and of some */
+    whole kinds;       /* of ages, in pairs of the second readout and the fallback: of losses of all measurements, and of some */
     whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
     whole patience;    /* measurements refused in a row, after which one is believed */
     const double *map;        /* (n + order, n_lifted + order + n_inputs + q) */
@@ -67,8 +67,9 @@ typedef struct {
     const double *pull;       /* (recorded, q) */
     const double *start;      /* (filters, n_lifted + n_inputs) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
-    const double *bank;       /* (3 kinds + 1, recorded, batch): half, recovery, longest age, recovery of a start */
-    double *gap;              /* (kinds recorded + 3 q + 2 + q filters, batch): age, counts of missing, refused and believed, ages of the start and of a loss, ramps; moved on */
+    const double *half;       /* (kinds, recorded) */
+    const double *recovery;   /* (2): of losses and of a start */
+    double *gap;              /* (kinds recorded + 3 q + 2 + q filters, batch): ages, counts of missing, refused and believed, ages of the last and the first start, ramps; moved on */
     double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
 
@@ -248,13 +249,13 @@ static vec level(vec age, vec half)
     return ratio * ratio / (1.0 + ratio * ratio);
 }
 
-/* How much the fallback counts for a state: the most of gaps of all and of some measurements. */
-static vec counted(const relift_job *s, const vec *bank, const vec *gap, whole at)
+/* How much the readout after losses (0) or the fallback (1) counts for a state: the most of losses of all and of some measurements. */
+static vec counted(const relift_job *s, const vec *gap, whole at, whole which)
 {
     const vec start = gap[(s->kinds * s->recorded + 3 * s->q) * MOST + at % MOST];
     vec most = either(start > OLDEST, (vec){0} + 1.0, (vec){0});
-    for (whole k = 0; k < s->kinds; k++) {
-        const vec share = level(gap[k * s->recorded * MOST + at], bank[k * s->recorded * MOST + at]);
+    for (whole k = which; k < s->kinds; k += 2) {
+        const vec share = level(gap[k * s->recorded * MOST + at], (vec){0} + s->half[k * s->recorded + at / MOST]);
         most = either(share > most, share, most);
     }
     return most;
@@ -262,7 +263,7 @@ static vec counted(const relift_job *s, const vec *bank, const vec *gap, whole a
 
 /* Gaps of a filter bank, see kros.observer.filter_bank for the symbols: measurements and what stands for missing ones, into states; straight lines
    over gaps that end. */
-static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *y, mask *missing, whole n, whole w)
+static void fill(const relift_job *s, vec *gap, vec *reg, vec *y, mask *missing, whole n, whole w)
 {
     const whole r = s->filters, recorded = s->recorded, ages = s->kinds * recorded;
     const vec *from_inputs = reg + (n - 2 * recorded) * MOST;
@@ -288,7 +289,7 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
         waits = *start > OLDEST;
         for (whole j = 0; j < s->q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
-            const vec seen = y[row], count = gap[ages * MOST + row], held = from_inputs[i] + offset[i], reach = (vec){0} + s->reach[s->measured[j]];
+            const vec seen = y[row], count = gap[ages * MOST + row], held = from_inputs[i] + offset[i], reach = s->reach[s->measured[j]] * (1.0 + start[MOST]);
             const vec near = clipped(reg[i] - held, -reach, reach);
             const mask ends = ~missing[row] & ~waits & (count > 0.0);
             const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
@@ -311,7 +312,7 @@ static void fill(const relift_job *s, const vec *bank, vec *gap, vec *reg, vec *
                 lost |= missing[j * MOST + v];
                 hidden &= s->measured[j] != i;
             }
-            const vec share = either(lost, (vec){0}, 1.0 - hidden * counted(s, bank, gap, at));
+            const vec share = either(lost, (vec){0}, 1.0 - hidden * counted(s, gap, at, 1));
             vec pulled = offset[at];
             for (whole j = 0; j < s->q; j++) pulled += s->pull[i * s->q + j] * either(lost, (vec){0}, innovation[j * MOST + v]);
             const vec moved = pulled + share * (reg[at] - from_inputs[at] - pulled);
@@ -340,7 +341,7 @@ static void restart(const relift_job *s, const formulas *f, vec *gap, vec *reg, 
 }
 
 /* The fallback into the next estimates; ages and ramps move on. */
-static void follow(const formulas *f, const vec *reg, const relift_job *s, const vec *bank, vec *gap, vec *next, const mask *missing, vec *ramp, whole n, whole columns, whole w)
+static void follow(const formulas *f, const vec *reg, const relift_job *s, vec *gap, vec *next, const mask *missing, vec *ramp, whole n, whole columns, whole w)
 {
     const whole r = s->filters, q = s->q, recorded = s->recorded, ages = s->kinds * recorded;
     for (whole v = 0; v < w; v++) {
@@ -366,18 +367,17 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
             }
             for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
         }
-        vec *start = gap + (ages + 3 * q) * MOST + v, *loss = start + MOST;
-        *loss = either(some, (vec){0} + OLDEST, *loss);
-        const vec begun = level(either(*start > *loss, *start, *loss), (vec){0} + 1.0);
-        *start *= either(*start > OLDEST, (vec){0} + 1.0, bank[3 * ages * MOST + v]);
-        *loss *= bank[(3 * ages + recorded) * MOST + v];
+        vec *start = gap + (ages + 3 * q) * MOST + v, *first = start + MOST;
+        const vec begun = level(*start, (vec){0} + 1.0), further = 1.0 + *first;
+        *start *= either(*start > OLDEST, (vec){0} + 1.0, (vec){0} + s->recovery[1]);
+        *first *= s->recovery[1];
         for (whole k = 0; k < s->kinds; k++) {
-            const mask lost = k ? some : all;
-            const vec gone = k ? either(all, (vec){0}, longest) : shortest;
+            const mask lost = k > 1 ? some : all;
+            const vec gone = k > 1 ? either(all, (vec){0}, longest) : shortest;
             for (whole i = 0; i < recorded; i++) {
                 const whole at = (k * recorded + i) * MOST + v;
-                const vec oldest = bank[2 * ages * MOST + at], old = gap[at];
-                const vec recovered = either(lost, old, bank[ages * MOST + at] * either(old > oldest, oldest, old));
+                const vec oldest = (vec){0} + OLDEST * s->half[k * recorded + i], old = gap[at];
+                const vec recovered = either(lost, old, s->recovery[0] * either(old > oldest, oldest, old));
                 gap[at] = either(gone > recovered, gone, recovered);
             }
         }
@@ -385,11 +385,12 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
             const whole at = i * MOST + v;
             int hidden = 1;
             for (whole j = 0; j < q; j++) hidden &= s->measured[j] != i;
-            next[at] += begun * (next[(n - 3 * recorded) * MOST + at] - next[at]);
+            next[at] += begun * (next[(n - 4 * recorded) * MOST + at] - next[at]);
+            next[at] += counted(s, gap, at, 0) * (next[(n - 3 * recorded) * MOST + at] - next[at]);
             next[at] = clipped(next[at], (vec){0} + s->limits[i], (vec){0} + s->limits[recorded + i]);
             const vec fallback = next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at];
-            const vec reach = (vec){0} + s->reach[i], apart = next[at] - fallback;
-            if (hidden) next[at] -= counted(s, bank, gap, at) * apart;
+            const vec reach = s->reach[i] * further, apart = next[at] - fallback;
+            if (hidden) next[at] -= counted(s, gap, at, 1) * apart;
             else next[at] = either(some, fallback + clipped(apart, -reach, reach), next[at]);
         }
     }
@@ -399,21 +400,19 @@ int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
     const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + 3 * q + 2 + q * s->filters : 0;
-    const whole numbers = (3 * s->kinds + 2) * recorded;
-    vec *bank = vectors(numbers), *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
+    vec *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;
     const whole groups = (rows + 3) / 4;
     double *map = room(4 * groups * columns * (whole)sizeof(double));
     const vec **column = room(groups * columns * (whole)sizeof(vec *));
     whole *counts = room(groups * (whole)sizeof(whole));
-    int failed = !counts || !bank || !gap || !missing || !ramp || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
+    int failed = !counts || !gap || !missing || !ramp || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
     for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
         const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
         settle(f, reg, first, batch, lanes);
         if (s->own)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
-        for (whole i = 0; i < numbers; i++) gather(bank + i * MOST, s->bank + i * batch + first, 1, lanes);
         for (whole i = 0; i < gaps; i++) gather(gap + i * MOST, s->gap + i * batch + first, 1, lanes);
         double *state = s->column + first, *past = s->past ? s->past + first * ne : NULL;
         for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
@@ -445,7 +444,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                     y[j * MOST + v] = either(seen - seen == 0.0, seen, x[v]);
                 }
             }
-            if (recorded) fill(s, bank, gap, reg, y, (mask *)missing, n, w);
+            if (recorded) fill(s, gap, reg, y, (mask *)missing, n, w);
             for (whole j = 0; j < q && recorded; j++) {
                 for (whole v = 0; v < w; v++) next[v] = either(((mask *)missing)[j * MOST + v], (vec){0} + NAN, y[j * MOST + v]);
                 scatter(s->y + (k * q + j) * batch + first, next, 1, lanes);
@@ -457,7 +456,7 @@ int kros_relift(const formulas *f, const relift_job *s)
             if (s->own) product_each(each, columns, column, next, rows, w);
             else product(map, counts, column, next, rows, w);
             shifted(f, reg, older);
-            if (recorded) follow(f, reg, s, bank, gap, next, (const mask *)missing, ramp, n, columns, w);
+            if (recorded) follow(f, reg, s, gap, next, (const mask *)missing, ramp, n, columns, w);
             if (!within(s, rows, next, lanes)) {
                 s->left[0] = 1;
                 break;
@@ -471,7 +470,7 @@ int kros_relift(const formulas *f, const relift_job *s)
         for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
         for (whole i = 0; i < gaps; i++) scatter(s->gap + i * batch + first, gap + i * MOST, 1, lanes);
     }
-    free(bank), free(gap), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);
+    free(gap), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);
     return failed;
 }
 

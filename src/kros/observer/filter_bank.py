@@ -1,8 +1,8 @@
 r"""What makes an observer a filter bank: how it starts, and what replaces missing measurements.
 
 While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its
-internal states are the filters z of measurements and inputs, whose estimate is given then, a second estimate
-:math:`x^s` from these for the time after a start or a loss, the filters w of inputs alone, their own estimate
+internal states are the filters z of measurements and inputs, whose estimate is given then, estimates :math:`x^s` and
+:math:`x^l` from these for the time after a start and after a loss, the filters w of inputs alone, their own estimate
 :math:`x^u` of all recorded states, and the distance o from it, which decays as machines do by themselves. Before a step
 
 .. math:: o_k \leftarrow o_k + (1 - m) (x_k - x^u_k - o_k), \qquad o_{k+1} = F o_k,
@@ -13,18 +13,17 @@ tends to :math:`x^u`; estimates in which the fallback counts already change it l
 measurements that have all arrived pull o by :math:`L (y - x^u - o)`, with L the regression of distances on those of
 measurements by a covariance X. As :math:`F X F' \le X`, F and :math:`I - L C` are contractions in one norm: by turns,
 they let no o grow. The age a of a gap is the number of samples that are missing so far; when measurements return it
-falls by a factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own :math:`\mu`:
-a state that is estimated from slow filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m
-is below one percent after five time constants of :math:`\mu`. Of several measurements, gaps of all and gaps of some
-have ages, T and :math:`\mu` of their own, and the larger m counts. The estimate of a state that is not measured is
+falls by a factor :math:`\mu` a sample, counted as :math:`0.1 e^5 T` at most, so that m is below one percent as soon as
+no delay reaches back to what stood for them. Of several measurements, gaps of all and gaps of some have ages and T of
+their own, and the larger m counts. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
-After a start, what happened before is not known; after a loss, filters hold what stood for measurements. There
-:math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start and at every loss.
-It falls so that m is below one percent some of the slowest time constants after a start, and as soon as no delay
-reaches back to a loss. Limits of the estimates hold before the fallback enters them, so that little of what is far away
-is left in long gaps.
+After a start, what happened before is not known; after a loss, filters hold what stood for measurements.
+:math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start, and then
+:math:`x + m (x^l - x)`, with ages like those of the fallback and H in place of T, least for what stands for
+measurements. Limits of the estimates hold before the fallback enters them, so that little of what is far away is left
+in long gaps.
 
 A measurement is refused, and counts as missing, where it is further from its estimate than :math:`b (1 + w / (1 + k))
 (1 + g)^2 (1 + r)`. Here b is the gate, k are the measurements that were believed since a start, and g and r the samples
@@ -34,7 +33,8 @@ further away than without g and r. If no more were believed before than refused 
 filters z start again, if all measurements are there, and those of inputs, their estimate and its distance go on. At a
 start without all measurements, inputs alone count until the first sample that has them; there the filters z start.
 
-A missing measurement is replaced by its estimate, at most a reach away from the fallback, and o of states that are not
+A missing measurement is replaced by its estimate, at most a reach away from the fallback (1 + a times as much at age a
+of the first start, since inputs alone say little of where a machine is then), and o of states that are not
 measured is no larger than theirs: what the filters see is bounded for any pattern of losses, and so are they. When a
 measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit ramp was run along,
 through the slopes of lifted functions at what stood for the measurement, and ``z`` is corrected by :math:`r (y - \hat
@@ -57,10 +57,9 @@ class FilterBank:
 
     filters: int
     start: Array
-    half: Array  # (1 or 2, n), T in gaps of all measurements and, of several, in gaps of some
-    recovery: Array  # (1 or 2, n)
+    half: Array  # (2 or 4, n), H and T of losses of all measurements and, of several, of losses of some
+    recovery: Array  # (2,), of losses and of a start
     reach: Array
-    start_recovery: Array
     gate: Array
     opening: Array  # (q,), w
     pull: Array  # (n, q)
@@ -69,12 +68,12 @@ class FilterBank:
         floats(self, "Filter bank", start="finite numbers", pull="finite numbers")
         floats(self, "Filter bank", half="positive and finite", gate="positive")
         floats(self, "Filter bank", reach="finite and not negative", opening="finite and not negative")
-        floats(self, "Filter bank", recovery="shares between 0 and 1", start_recovery="shares between 0 and 1")
+        floats(self, "Filter bank", recovery="shares between 0 and 1")
 
     @property
     def patience(self) -> int:
         """Samples that a start takes: after as many refused in a row a measurement is believed."""
-        return round(-5 / np.log(self.start_recovery[0]))
+        return round(-5 / np.log(self.recovery[1]))
 
 
 def level(age: Array, half: Array | float = 1.0) -> Array:
@@ -83,12 +82,7 @@ def level(age: Array, half: Array | float = 1.0) -> Array:
     return ratio * ratio / (1 + ratio * ratio)
 
 
-def longest_age(half: Any) -> Any:
-    """Return the largest ages that count when measurements return: m is then below 1 % after five time constants."""
-    return 0.1 * np.exp(5) * half
-
-
-OLDEST = float(longest_age(1.0))  # age of a start
+OLDEST = 0.1 * float(np.exp(5))  # largest age over `half` when measurements return, and age of a start
 _WAITING = 2 * OLDEST  # stands for it until a sample has all measurements
 
 
@@ -100,8 +94,8 @@ class Gaps:
         self.limits = limits
         self.bank, self.measured, self.recorded = bank, list(measured), recorded
         self.filters = slice(recorded, recorded + bank.filters)
-        self.after_start, self.from_inputs, self.offset = (
-            slice(n - k * recorded, n - (k - 1) * recorded) for k in (3, 2, 1)
+        self.after_start, self.after_loss, self.from_inputs, self.offset = (
+            slice(n - k * recorded, n - (k - 1) * recorded) for k in (4, 3, 2, 1)
         )
         self._A = A[self.filters, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
@@ -109,7 +103,7 @@ class Gaps:
         self.take(np.zeros((bank.half.size + 3 * q + 2 + q * bank.filters, batch)))
 
     def take(self, state: Array) -> None:
-        """Go on from a state: ages; missing, refused, believed samples; ages of a start and of a loss; ramps."""
+        """Go on from a state: ages; missing, refused, believed samples; of the last and the first start; ramps."""
         n, q = self.bank.half.size, len(self.measured)
         self.state = state
         age, self.count, self.refusals, self.believed, self.start, ramp = np.split(
@@ -121,17 +115,21 @@ class Gaps:
     def begin(self, rows: Any, missing: Flags) -> None:
         """Start some machines at measurements of which some may be missing."""
         self.state[:, rows] = 0.0
-        self.start[rows, 0] = np.where(missing.any(axis=1), _WAITING, OLDEST)[rows]
+        self.start[rows] = np.where(missing.any(axis=1, keepdims=True), [_WAITING, OLDEST], OLDEST)[rows]
 
     @property
     def waiting(self) -> Flags:
         """The machines whose filters wait for a sample that has all measurements."""
         return self.start[:, 0] > OLDEST
 
+    def share(self, which: int) -> Array:
+        """How much the readout after losses (0) or the fallback (1) counts, (batch, n)."""
+        return np.where(self.waiting[:, None], 1.0, level(self.age, self.bank.half)[:, which::2].max(axis=1))
+
     @property
-    def share(self) -> Array:
-        """How much the fallback counts, (batch, n)."""
-        return np.where(self.waiting[:, None], 1.0, level(self.age, self.bank.half).max(axis=1))
+    def reach(self) -> Array:
+        """How far what stands for measurements may be from the fallback, (batch, q)."""
+        return self.bank.reach[self.measured] * (1 + self.start[:, 1:])
 
     def gated(self, x: Array, y: Array) -> Array:
         """Return measurements (batch, q), NaN in place of those that are too far from their estimates to be true."""
@@ -150,8 +148,8 @@ class Gaps:
 
     def fill(self, x: Array, y: Array, missing: Flags) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
-        share, recorded, offset = self.share, x[:, : self.recorded], x[:, self.offset]
-        reach, held = self.bank.reach[self.measured], (x[:, self.from_inputs] + offset)[:, self.measured]
+        share, recorded, offset = self.share(1), x[:, : self.recorded], x[:, self.offset]
+        reach, held = self.reach, (x[:, self.from_inputs] + offset)[:, self.measured]
         expected = held + np.clip(x[:, self.measured] - held, -reach, reach)
         ends = ~missing & (self.count > 0) & ~self.waiting[:, None]
         jump = np.where(ends, (y - expected) / (self.count + 1), 0.0)
@@ -179,18 +177,16 @@ class Gaps:
         """
         bank, some, none = self.bank, np.asarray(missing.any(axis=1)), np.asarray(missing.all(axis=1))
         count = np.where(missing, self.count + 1, 0.0)
-        longest, shortest = count.max(axis=1), count.min(axis=1)
-        lost, lengths = (
-            np.stack(both, axis=1)[:, : len(bank.half), None] for both in ((none, some), (shortest, longest * ~none))
-        )
-        recovered = np.where(lost, self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
+        pairs = (none, some), (count.min(axis=1), count.max(axis=1) * ~none)
+        lost, lengths = (np.stack(p, axis=1)[..., None].repeat(2, axis=1)[:, : len(bank.half)] for p in pairs)
+        recovered = np.where(lost, self.age, bank.recovery[0] * np.minimum(self.age, OLDEST * bank.half))
         self.age[...] = np.maximum(recovered, lengths)
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
-        self.start[some, 1] = OLDEST
-        recorded += level(self.start.max(axis=1, keepdims=True)) * (following[:, self.after_start] - recorded)
+        recorded += level(self.start[:, :1]) * (following[:, self.after_start] - recorded)
+        recorded += self.share(0) * (following[:, self.after_loss] - recorded)
         np.clip(recorded, *self.limits, out=recorded)
-        recorded += self.hidden * self.share * (fallback - recorded)
-        at, reach = self.measured, bank.reach[self.measured]
+        recorded += self.hidden * self.share(1) * (fallback - recorded)
+        at, reach = self.measured, self.reach
         near = fallback[:, at] + np.clip(recorded[:, at] - fallback[:, at], -reach, reach)
         recorded[:, at] = np.where(some[:, None], near, recorded[:, at])
         if slopes is None:
@@ -198,7 +194,7 @@ class Gaps:
         else:
             self.ramp[...] = np.where(missing[:, None], self._A @ self.ramp + slopes * count[:, None], 0.0)
         waiting = self.waiting
-        self.count[...], self.start[...] = count, bank.start_recovery * self.start
+        self.count[...], self.start[...] = count, bank.recovery[1] * self.start
         self.believed += ~missing
         self.start[waiting, 0] = _WAITING
 
@@ -206,8 +202,6 @@ class Gaps:
     def job(self) -> Record:
         """What the compiled loop needs of gaps."""
         bank = self.bank
-        starts = np.repeat(bank.start_recovery[:, None], bank.half.shape[1], axis=1)
-        rows = np.vstack([bank.half, bank.recovery, longest_age(bank.half), starts])
         return {
             "recorded": self.recorded,
             "kinds": len(bank.half),
@@ -219,6 +213,7 @@ class Gaps:
             "pull": bank.pull,
             "patience": bank.patience,
             "limits": np.array(self.limits),
-            "bank": np.repeat(rows[..., None], self.state.shape[1], axis=-1),
+            "half": bank.half,
+            "recovery": bank.recovery,
             "gap": self.state.copy(),
         }

@@ -62,7 +62,7 @@ def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, 
     x, u = (old.sizes_of(names) / new.sizes_of(names) for names in (old.names, inputs))
     if observer.bank is not None:  # its last states have the units of the recorded ones
         n, recorded = old.n_states, len(observer.recorded)
-        x[n - 3 * recorded : n] = np.tile(x[:recorded], 3)
+        x[n - 4 * recorded : n] = np.tile(x[:recorded], 4)
     return x, u
 
 

@@ -12,7 +12,7 @@ from ...core import Array, ConfigError, Record, frozen
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer, recorded_channel, recorded_factors
-from ...observer.filter_bank import OLDEST, longest_age
+from ...observer.filter_bank import OLDEST
 from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, Screen
@@ -135,7 +135,6 @@ class Source:
             "history": len(lifting.window.earlier),
             "guard": np.clip([low, high], -self.precision.largest, self.precision.largest),
             "bounds": self.bounds(),
-            "longest_age": longest_age,
             "gate": () if o.bank is None else np.minimum(o.bank.gate, self.precision.largest),
             "OLDEST": OLDEST,
             "ages": 0 if o.bank is None else o.bank.half.size,

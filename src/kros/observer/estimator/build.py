@@ -24,6 +24,8 @@ from .regression import Readout, is_less
 from .rows import Design, Group, Recordings
 from .settings import EstimatorSettings
 
+READOUTS = ("after_start", "after_loss")  # beside that of all other time
+
 
 @frozen
 class Identified:
@@ -209,24 +211,25 @@ def assembled(
     """Write filters with their readouts, and those of inputs alone, into the model of an observer."""
     channels, bank = design.channels, design.bank
     without, settings = channels.without_measurements(), design.settings
-    fades = np.array([settings.start_fade * max([*bank.lags, bank.delays]), bank.delays])  # m is below one percent then
+    fade = settings.start_fade * max([*bank.lags, bank.delays])  # m is below one percent then
     filters, fallback = systems[0].absolute(channels), systems[1].absolute(without)
     n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
     bare = channels.lifting
     own = [*(f"filter_{i + 1}" for i in range(r)), *(f"input_filter_{i + 1}" for i in range(s))]
-    own += [f"{state}_{what}" for what in ("after_start", "from_inputs", "offset_from_inputs") for state in bare.states]
+    own += [f"{state}_{what}" for what in (*READOUTS, "from_inputs", "offset_from_inputs") for state in bare.states]
     widened = replace(bare, states=(*bare.states, *own))
     total, columns = widened.n_states, widened.n_lifted + len(inputs) + len(bare.input_functions)
     places = [c if c < n else c + total - n for c in channels.columns]
     blind = [c + total - n for c in without.columns]
-    z, w, f, u = np.split(np.arange(n, total - n), np.cumsum([r, s, n]))
+    z, w, f, u = np.split(np.arange(n, total - n), np.cumsum([r, s, len(READOUTS) * n]))
     x, at = np.arange(n), list(channels.measured)
     model, start = np.zeros((total, columns)), np.zeros((total, columns))
-    first = (filters.C @ filters.S + filters.D)[n:]  # as if nothing had moved before: no step at the start
+    after = filters.C @ filters.S + filters.D  # as if nothing had moved before: no step at the start
+    first = after[n : 2 * n]
     first[at] = np.eye(len(at), len(channels))
     for rows, states, inputs_of, *system in (
         (x, z, places, filters.C[:n], filters.D[:n], first),
-        (f, z, places, filters.C[n:], filters.D[n:], first),
+        (f, z, places, filters.C[n:], filters.D[n:], after[n:]),
         (z, z, places, filters.A, filters.B, filters.S),
         (w, w, blind, fallback.A, fallback.B, fallback.S),
         (u, w, blind, fallback.C, fallback.D, fallback.C @ fallback.S + fallback.D),
@@ -237,14 +240,12 @@ def assembled(
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[:n] for end in design.recordings.ranges)
-    ages = np.ones((min(2, len(at)), n))
     gaps = FilterBank(
         r,
         start,
-        ages,
-        np.zeros_like(ages),
+        np.ones((2 * min(2, len(at)), n)),
+        np.exp([-5 / bank.delays, -5 / fade]),
         high - low,
-        np.exp(-5 / fades),
         np.full(len(at), np.inf),
         np.zeros(len(at)),
         np.zeros((n, len(at))),
@@ -268,5 +269,5 @@ def assembled(
 
 def settle_samples(systems: Sequence[Filters], recovery: Array) -> int:
     """Return the samples after which a disturbance is below one percent: five of the slowest time constants."""
-    slowest = max([*(float(spectral_radius(f.A)) for f in systems), *recovery.ravel()])
+    slowest = max([*(float(spectral_radius(f.A)) for f in systems), *recovery])
     return int(np.ceil(-5 / np.log(slowest))) if slowest > 0 else 1

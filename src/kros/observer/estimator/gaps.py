@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core import TINY, Array, Flags, Parameters
 from ...core.linalg import pieces
-from ..filter_bank import FilterBank, level, longest_age
+from ..filter_bank import OLDEST, FilterBank, level
 from ..observer import Observer
 from ..simulate import Course
 from .rows import Recordings
@@ -74,44 +74,45 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
 def with_gaps(
     bank: FilterBank, trials: Sequence[tuple[Observer, Recordings]], F: Array, settings: EstimatorSettings
 ) -> FilterBank:
-    """Return a filter bank with the ages of gaps that suit all simulated losses of trials best.
+    """Return a filter bank with the ages that suit all simulated losses of trials best.
 
     Errors count by their ratios to the least of any ages in the same loss, by mean squares of logarithms, so that gaps
-    of all lengths do; trials do not know their recordings. Gaps of all measurements and, of several, gaps of some have
-    ages of their own. Measured states have none: their substitutes are near the fallback always.
+    of all lengths do; trials do not know their recordings. Ages of the fallback come first, then those of the readout
+    after losses. What stands for a measurement has that readout at every loss, and is near the fallback always.
     """
     at = list(trials[0][0].measured)
     hidden = [i for i in range(len(F)) if i not in at]
-    half, recovery = np.full_like(bank.half, _NEVER), np.zeros_like(bank.half)
-    if not hidden:
-        return replace(bank, half=half, recovery=recovery)
-    rng = np.random.default_rng(settings.seed)
+    half = np.full_like(bank.half, _NEVER)
     longest = settings.longest(float(np.median([recordings.length for _, recordings in trials])))
-    ages, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
-    T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(ages, recoveries))
+    ages = longest * np.array(settings.halves)
+    half[::2, at] = ages[0]
+    if not hidden:
+        return replace(bank, half=half)
+    rng = np.random.default_rng(settings.seed)
     samples, patterns = (-(-each // len(trials)) for each in (settings.gap_samples, settings.gap_episodes))
     length = min(min(recordings.lengths) for _, recordings in trials)
     seen = [training(trial, recordings, samples, patterns, length) for trial, recordings in trials]
-    errors = np.zeros((len(half), len(T), len(hidden)))
-    for kind in range(len(half)):
+    for kind in range(0, len(half), 2):
         runs = []
         for (trial, _), (states, y, inputs, own) in zip(trials, seen, strict=True):
             lost, sensors = losses(rng, *y.shape[:2]), np.ones(y.shape[1:], dtype=bool)
             if kind:
                 sensors = rng.permuted(np.arange(len(at)) < rng.integers(1, len(at), (len(sensors), 1)), axis=1)
             assert trial.bank is not None
-            side = replace(trial, bank=replace(trial.bank, half=half, recovery=recovery))
+            side = replace(trial, bank=replace(trial.bank, half=half))
             shown = np.where(lost[..., None] & sensors, np.nan, y)
-            filtered, from_inputs = np.split(recorded_estimates(side, shown, inputs, own), 2, axis=-1)
-            filtered[..., at] = states[..., at]
-            runs.append((states, filtered, from_inputs, lost))
-        states, filtered, from_inputs, lost = (np.concatenate(each, axis=1) for each in zip(*runs, strict=True))
-        squares = blended_errors(states, filtered, from_inputs, lost, F, bank.pull, at, T, mu)[..., hidden]
-        logs = np.log(np.maximum(squares, TINY))
-        errors[kind] = ((logs - logs.min(axis=0)) ** 2).mean(axis=1)
-    choice = errors.argmin(axis=1)
-    half[:, hidden], recovery[:, hidden] = T[choice, 0], mu[choice, 0]
-    return replace(bank, half=half, recovery=recovery)
+            estimates = np.split(recorded_estimates(side, shown, inputs, own), 3, axis=-1)
+            estimates[0][..., at] = states[..., at]
+            runs.append((lost, states, *estimates))
+        lost, *signals = (np.concatenate(each, axis=1) for each in zip(*runs, strict=True))
+        half[kind, hidden] = ages[0]
+        for row in (1, 0):
+            candidates = np.repeat(half[kind : kind + 2, None], len(ages), axis=1)
+            candidates[row, :, hidden] = ages
+            squares = blended_errors(lost, signals, F, replace(bank, half=candidates), at)[..., hidden]
+            logs = np.log(np.maximum(squares, TINY))
+            half[kind + row, hidden] = ages[((logs - logs.min(axis=0)) ** 2).mean(axis=1).argmin(axis=0)]
+    return replace(bank, half=half)
 
 
 def distances(
@@ -127,7 +128,7 @@ def distances(
     states, y, inputs, own = training(
         observer, recordings, settings.gap_samples, settings.gap_episodes, min(recordings.lengths)
     )
-    apart = states - recorded_estimates(observer, y, inputs, own)[..., n:]
+    apart = states - recorded_estimates(observer, y, inputs, own)[..., 2 * n :]
     start = min(observer.bank.patience, len(y) // 2)
     count = len(y) // start
     shown, inputs = (np.hstack(np.split(v[: count * start], count)) for v in (y, inputs))
@@ -159,35 +160,33 @@ def pull_of(F: Array, apart: Array, rms: Array, measured: list[int]) -> Array:
 
 
 def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Parameters) -> Array:
-    """Return the estimates of recorded states and those from inputs alone, (n_samples, batch, 2 n)."""
+    """Return the estimates of recorded states, those after a loss and from inputs alone, (n_samples, batch, 3 n)."""
     course, n = Course(observer, y.shape[1], parameters), len(observer.recorded)
-    some = [*range(n), *range(-2 * n, -n)]
+    some = [*range(n), *range(-3 * n, -n)]
     return np.concatenate([course.take(y[k], u[k]).estimates[..., some] for k in pieces(len(y), _ROWS)])
 
 
-def blended_errors(
-    states: Array,
-    filtered: Array,
-    from_inputs: Array,
-    missing: Flags,
-    F: Array,
-    pull: Array,
-    measured: list[int],
-    half: Array,
-    recovery: Array,
-) -> Array:
-    """Return mean squared errors (c, batch, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
-    count, age, fading = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1])), np.ones(len(F))
+def blended_errors(missing: Flags, signals: Sequence[Array], F: Array, bank: FilterBank, measured: list[int]) -> Array:
+    """Return mean squared errors (c, batch, n) of candidates of half in a bank, (2, c, n), see `Gaps.follow`.
+
+    Signals are the states, and estimates of them for undisturbed time, after losses, and from inputs alone.
+    """
+    states, filtered, after_loss, from_inputs = signals
+    half, fading = bank.half[:, :, None], np.ones(len(F))
     fading[measured] = 0.0
-    x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros_like(filtered[:1])
-    offset, blend = x - from_inputs[0], np.zeros((*age.shape, 1))
+    x, squares = np.repeat(filtered[:1], half.shape[1], axis=0), np.zeros_like(filtered[:1])
+    offset, age, count = x - from_inputs[0], np.zeros((2, *x.shape)), np.zeros(missing.shape[1])
+    blend = age[1]
     for k, lost in enumerate(missing[:-1]):
         share = np.where(lost[:, None], 1.0, fading * blend)
-        offset = offset + (~lost[:, None] * (x - from_inputs[k] - offset))[..., measured] @ pull.T
+        offset = offset + (~lost[:, None] * (x - from_inputs[k] - offset))[..., measured] @ bank.pull.T
         offset = (offset + (1 - share) * (x - from_inputs[k] - offset)) @ F.T
         count = np.where(lost, count + 1, 0.0)
-        age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)
-        blend = level(age, half)[..., None]
-        x = filtered[k + 1] + fading * blend * (from_inputs[k + 1] + offset - filtered[k + 1])
+        age = np.maximum(
+            np.where(lost[:, None], age, bank.recovery[0] * np.minimum(age, OLDEST * half)), count[:, None]
+        )
+        after, blend = level(age, half)
+        x = filtered[k + 1] + fading * after * (after_loss[k + 1] - filtered[k + 1])
+        x += fading * blend * (from_inputs[k + 1] + offset - x)
         squares = squares + (x - states[k + 1]) ** 2
     return squares / len(missing)

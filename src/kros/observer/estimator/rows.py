@@ -118,18 +118,22 @@ def spread(items: Sequence[T], count: int) -> list[T]:
     return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
 
 
+SAMPLED = ("rows", "restarts", "elsewhere", "bridges", "errors")
+
+
 @frozen
 class Sample:
     """Moments of thinned rows of a bank, as triangles R (., p): a mean over rows is the sum of squares of R's."""
 
     rows: Array
     restarts: Array  # what a start in the middle of an episode changes
-    elsewhere: Array  # what a first sample at another place changes, and straight lines over lost measurements
+    elsewhere: Array  # what a first sample at another place changes
+    bridges: Array  # what straight lines over lost measurements change
     errors: Array  # what errors of measurements change, with their weights
 
     def of(self, columns: Whole) -> Sample:
         """Return the moments of some entries."""
-        return Sample(*(triangle[:, columns] for triangle in (self.rows, self.restarts, self.elsewhere, self.errors)))
+        return Sample(*(getattr(self, name)[:, columns] for name in SAMPLED))
 
 
 class Triangles:
@@ -222,11 +226,11 @@ class Design:
             if not self.channels.inputs_only:
                 lost = np.random.default_rng(settings.seed).random(len(y)) < 0.5
                 changes = self.seen(self.signals(batch, bridged(y, lost)), at) - rows
-                triangles.add("elsewhere", np.sqrt(settings.gap_share / settings.start_share) * root * changes)
+                triangles.add("bridges", root * changes)
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
                 triangles.add("errors", root * (self.seen(self.signals(batch, y + bias), at) - rows))
             weight += weights.sum()
-        return Sample(*(triangles.of(name) / np.sqrt(weight) for name in ("rows", "restarts", "elsewhere", "errors")))
+        return Sample(*(triangles.of(name) / np.sqrt(weight) for name in SAMPLED))
 
     def measurements(self, batch: EpisodeBatch) -> Array:
         """Return the measurements of an episode, (n_samples, q), as if all arrived: losses have rows of their own."""

@@ -76,10 +76,10 @@ class EstimatorSettings(Settings):
     )
     settled_share: float = Field(3e-3, gt=0, description="weight of the errors of `restart_share` for all other time")
     gap_share: float = Field(
-        1e-4,
+        0.01,
         ge=0,
         description="weight of the errors that straight lines over lost measurements make, half of them, for the time "
-        "after a start or a loss",
+        "after a loss",
     )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"
@@ -91,14 +91,10 @@ class EstimatorSettings(Settings):
         description="ratio of the weights of hidden and measured states in the reduction",
     )
     halves: tuple[float, ...] = Field(
-        (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
+        (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
         min_length=1,
-        description="ages of a gap at which the fallback counts one half, in longest delays; training chooses",
-    )
-    recoveries: tuple[float, ...] = Field(
-        (0.3, 3.0, 30.0),
-        min_length=1,
-        description="time constants of the age when measurements return, in longest delays; training chooses",
+        description="ages of a gap at which the readout after losses and the fallback count one half, in longest delays; "
+        "training chooses",
     )
     room: float = Field(
         0.25,

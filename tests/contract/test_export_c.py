@@ -213,7 +213,7 @@ def test_a_folder_with_content_is_left_alone(tmp_path):
 
 def test_an_estimate_within_rounding_of_its_limit_is_not_sure_to_be_inside():
     lag = Observer.open_loop("lag", Lifting(("x",)), np.zeros((1, 1)), np.ones((1, 1)), (0,), ("u",), 0.01)
-    limited = replace(lag, runtime=Runtime(upper=np.array([0.5 + 1e-6])))
+    limited = replace(lag, runtime=Runtime(upper=np.array([Golden.of(lag).x_hat.max() + 1e-6])))
     golden = Golden.of(limited, tolerance=1e-3)
     assert not (golden.status & SampleStatus.LIMIT).any()
     assert 0 < np.sum(golden.sure[0] & SampleStatus.LIMIT == 0) < len(golden.status)

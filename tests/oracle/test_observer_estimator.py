@@ -205,7 +205,8 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     made = design(alone, settings=settings)
     whitening = Whitening.of(readout.design, readout.design.sample())
     (moments,) = Moments.of([made], [whitening])
-    (coefficients,) = moments.solved(np.ones(len(moments.groups)), [tuple(readout.penalties[1])])
+    weights = 1e-8, 0.0, settings.settled_share, 0.0
+    (coefficients,) = moments.solved(np.ones(len(moments.groups)), [weights])
     group = readout.design.groups[key]
     np.testing.assert_allclose(
         readout.others[group][:, 1],

@@ -5,7 +5,7 @@ A sample is judged by itself, before the observer sees it:
 | what arrives | what the observer takes | status |
 |---|---|---|
 | a measurement that is missing or not finite | nothing: it corrects nothing | `MISSING` |
-| an input that is not finite | the last good one; zero before the first | `INVALID_INPUT` |
+| an input that is not finite | the last good one, zero before the first; five samples on with its slope | `INVALID_INPUT` |
 | a sample beyond a declared limit | the limit | `LIMIT` |
 | a sample beyond 1.5 times its range | as if it were missing, or not finite | `LIMIT` |
 
@@ -33,7 +33,7 @@ from .data import ObserverData
 from .runtime import Seen
 
 BEYOND = 1.5  # times the range: what is further away is implausible
-LONGEST = 5  # samples for which an input may be held without a new start, except in filter banks, which forget it
+LONGEST = 5  # samples for which an input goes on with its slope; held longer, it makes all but filter banks start anew
 NEVER = 2**32 - 1  # samples since an input that was never known
 
 
@@ -45,7 +45,7 @@ class SampleStatus(IntFlag):
     MISSING
         A measurement is missing or not finite. It corrected nothing.
     INVALID_INPUT
-        An input is not finite. The last good value stood for it.
+        An input is not finite. The last good value and slope stood for it.
     LIMIT
         A sample is beyond its limit or 1.5 times its range or was refused (see `filter_bank`), or the estimate or the
         correction met a limit that is declared.
@@ -74,16 +74,18 @@ class SampleStatus(IntFlag):
 
 @frozen
 class Held:
-    """Inputs held from sample to sample."""
+    """Last good inputs, and their last changes in a sample."""
 
     inputs: Array  # (batch, m)
+    slopes: Array  # (batch, m)
     since: Index  # (batch, m)
     stale: Flags  # (batch,)
 
     @classmethod
     def nothing(cls, batch: int, m: int) -> Held:
         """Return what is known before the first sample."""
-        return cls(np.zeros((batch, m)), np.full((batch, m), NEVER), np.ones(batch, dtype=bool))
+        none = np.zeros((batch, m))
+        return cls(none, none, np.full((batch, m), NEVER), np.ones(batch, dtype=bool))
 
 
 @frozen
@@ -147,12 +149,16 @@ class Screen:
         good, count = plausible[..., q:], np.arange(1, len(u) + 1)[:, None, None]
         latest = np.maximum.accumulate(np.where(good, count, 0), axis=0)
         since = np.where(latest > 0, count - latest, count + before.since)
-        inputs = np.take_along_axis(np.concatenate([before.inputs[None], within[..., q:]]), latest, axis=0)
+        last = np.take_along_axis(np.concatenate([before.inputs[None], within[..., q:]]), latest, axis=0)
+        earlier, ago = (np.concatenate([b[None], v[:-1]]) for b, v in ((before.inputs, last), (before.since, since)))
+        slopes = np.concatenate([before.slopes[None], np.where(ago > LONGEST, 0.0, (last - earlier) / (ago + 1))])
+        slopes = np.take_along_axis(slopes, latest, axis=0)
+        inputs = last + slopes * np.minimum(since, LONGEST)
         lost = np.asarray((since > self.longest).any(axis=-1))
         complete = np.asarray(good.all(axis=-1) & self.enough(plausible[..., :q]))
         starts, stale = _starts(lost, complete, before.stale)
         y = np.where(plausible, within, np.nan)[..., :q]
-        return Screened(y, inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))
+        return Screened(y, inputs, status, starts, complete, Held(last[-1], slopes[-1], since[-1], stale))
 
 
 def screened(observer: ObserverData, y: ArrayLike, u: ArrayLike, held: Held | None = None) -> Screened:

@@ -15,7 +15,7 @@ from ...observer import Observer, recorded_channel, recorded_factors
 from ...observer.filter_bank import OLDEST
 from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
-from ...observer.screen import BEYOND, Screen
+from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ..text import plain, plain_names, require_identifier
 from .origin import RULE, OriginShift, find_shift
@@ -140,6 +140,7 @@ class Source:
             "ages": 0 if o.bank is None else o.bank.half.size,
             "rule": {"beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},
             "longest": Screen.of(o).longest,
+            "LONGEST": LONGEST,
             "far": RULE.far,
             "model": self.sums(model),
             "correction": self.sums(correction),

@@ -16,7 +16,7 @@ from dataclasses import field, replace
 import numpy as np
 
 from ...core import EPS, Array, frozen
-from ...core.linalg import balanced_size
+from ...core.linalg import balanced_size, qr_triangle
 from ...core.norms import gramian_root
 from ...identify.free_run import recursion
 from .channels import Channels
@@ -89,7 +89,7 @@ def reduced(readout: Readout, order: int | None = None) -> Filters:
     C = coefficients.T * size @ A
     D = coefficients.T * size @ B
     used = np.isfinite(errors) & (errors > 0)
-    root = gramian_root(A.T, (C[used] / errors[used, None]).T).T
+    root = observability_root(A, C[used] / errors[used, None], design.bank.delays)
     _, values, U = np.linalg.svd(root, full_matrices=False)
     kept = values > EPS * values[0]
     L, inverse = values[kept, None] * U[kept], U[kept].T / values[kept]
@@ -111,3 +111,17 @@ def reduced(readout: Readout, order: int | None = None) -> Filters:
     # of errors that grow as little as asked, the least order
     bound = next((n for n in (2**i for i in range(len(sigma).bit_length())) if enough(n)), len(sigma))
     return whole.first(bisect_left(range(bound), True, lo=1 + bound // 2, key=enough)).modal()
+
+
+def observability_root(A: Array, C: Array, delays: int) -> Array:
+    """Return L with L' L the observability Gramian: delays end after so many samples, what is slower goes on alone."""
+    rows = [C]
+    for _ in range(delays):
+        rows.append(rows[-1] @ A)
+    slow = rows[-1].any(axis=0)
+    tail = np.zeros((0, len(A)))
+    if slow.any():
+        root = gramian_root(A[np.ix_(slow, slow)].T, rows[-1][:, slow].T).T
+        tail = np.zeros((len(root), len(A)))
+        tail[:, slow] = root
+    return qr_triangle(np.vstack([*rows[:-1], tail]))

@@ -144,7 +144,6 @@ class Readout:
     coefficients: Array  # (p, 3 n): of all states, and of these for the time after a start and after a loss
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
-    penalties: Array  # (n, 4), and weights of starts elsewhere, of restarts and of bridges
     others: dict[Group, Array]  # coefficients (p, 3 n) that do not know a group, over the sizes
 
     @classmethod
@@ -178,7 +177,6 @@ class Readout:
             whitening.directions @ coefficients * np.tile(design.recordings.size, 3),
             np.array([errors[i, choice[:n], states[:n]] for i, choice in enumerate(nested)]),
             moments.errors(coefficients[:, :n]),
-            np.array(candidates)[best[:n]],
             {g: whitening.directions @ np.array(each)[choice, :, states].T for (g, each), choice in unaware},
         )
 

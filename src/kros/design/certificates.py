@@ -242,5 +242,5 @@ def error_maps(task: DesignTask, design: Design, problem: ObserverProblem) -> tu
     """Return the system from what drives plants of the set to the weighted error of an observer, and the mean error."""
     if design.observer.bank is None:
         return problem.error_system(design.synthesis.controller), np.zeros(1)
-    estimate, mean = linear_estimate(design.observer, task.models.lifting, design.facts["outside_models_percent"])
+    estimate, mean = linear_estimate(design.observer, task.models.lifting)
     return problem.estimate_error(estimate), problem.scaled[3] @ (mean / problem.output_scale)

@@ -65,10 +65,9 @@ class FilterBank:
     pull: Array  # (n, q)
 
     def __post_init__(self) -> None:
-        floats(self, "Filter bank", start="finite numbers", pull="finite numbers")
+        floats(self, "Filter bank", start="finite numbers", pull="finite numbers", recovery="shares between 0 and 1")
         floats(self, "Filter bank", half="positive and finite", gate="positive")
         floats(self, "Filter bank", reach="finite and not negative", opening="finite and not negative")
-        floats(self, "Filter bank", recovery="shares between 0 and 1")
 
     @property
     def patience(self) -> int:

@@ -16,7 +16,6 @@ from ...synthesis.result import Injection
 from ..filter_bank import FilterBank
 from ..observer import Observer
 from ..runtime import Runtime
-from .certificate import outside_percent
 from .channels import FAMILIES, channels_of
 from .gaps import distances, with_gaps
 from .reduction import Filters, reduced
@@ -132,7 +131,6 @@ def identify_estimator(
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
         "left_out_worst_percent": by_state(100 * worst),
-        "outside_models_percent": by_state(outside_percent(readout, lifting)),
         "settle_samples": settle_samples((filters, fallback), bank.recovery),
     }
     return Identified(observer, readout, facts)

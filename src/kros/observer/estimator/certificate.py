@@ -26,7 +26,6 @@ from ..data import ObserverData
 from ..sensor import delay_of
 from ..sensor_gains import noise_response
 from .channels import CONSTANT, without_limits
-from .regression import Readout
 
 ASSUMPTIONS = (
     "the machine and the observer have the same inputs",
@@ -71,19 +70,12 @@ def linear_part(observer: ObserverData, modelled: Lifting) -> tuple[StateSpace, 
     return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])), observer.sample_period_s), mean, unknown
 
 
-def linear_estimate(
-    observer: ObserverData, modelled: Lifting, outside: Mapping[str, float] | None = None
-) -> tuple[StateSpace, Array]:
-    """Return `linear_part` with its mean, or say why a certificate for the set of plants cannot follow from it.
-
-    What channels without a signal contribute is `outside`, as `outside_percent` found it.
-    """
+def linear_estimate(observer: ObserverData, modelled: Lifting) -> tuple[StateSpace, Array]:
+    """Return `linear_part` with its mean, or say why a certificate for the set of plants cannot follow from it."""
     system, mean, unknown = linear_part(observer, modelled)
     if unknown:
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
-        shares = ", ".join(f"{name} {percent:.3g} %" for name, percent in (outside or {}).items() if percent)
-        share = f"; the missing ones contribute, in percent of the range: {shares}" if shares else ""
-        raise SynthesisError(f"the models have no signal {without_limits(unknown[0])}{more}{share}.")
+        raise SynthesisError(f"the models have no signal {without_limits(unknown[0])}{more}.")
     return system, mean
 
 
@@ -91,17 +83,6 @@ def _signals(lifting: Lifting, inputs: Sequence[str]) -> list[str]:
     """Return the columns after the states of [theta(x); u; gamma(u, x)]."""
     functions, of_inputs = ([f.text for f in formulas] for formulas in (lifting.formulas, lifting.input_formulas))
     return [*functions, *inputs, *of_inputs]
-
-
-def outside_percent(readout: Readout, modelled: Lifting) -> Array:
-    """Return the RMS of what channels without a signal in models add to estimates, (n,), percent of states' sizes."""
-    design, own = readout.design, readout.design.channels.lifting
-    known = {*own.states, *_signals(modelled, own.inputs), CONSTANT}
-    texts = [*own.states, *_signals(own, own.inputs)]
-    outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
-    size = design.recordings.size
-    added = readout.sample[:, outside] @ readout.coefficients[outside, : len(size)]
-    return 100 * np.linalg.norm(added, axis=0) / size
 
 
 def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCertificate:

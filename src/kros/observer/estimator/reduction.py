@@ -119,9 +119,5 @@ def observability_root(A: Array, C: Array, delays: int) -> Array:
     for _ in range(delays):
         rows.append(rows[-1] @ A)
     slow = rows[-1].any(axis=0)
-    tail = np.zeros((0, len(A)))
-    if slow.any():
-        root = gramian_root(A[np.ix_(slow, slow)].T, rows[-1][:, slow].T).T
-        tail = np.zeros((len(root), len(A)))
-        tail[:, slow] = root
-    return qr_triangle(np.vstack([*rows[:-1], tail]))
+    tail = gramian_root(A[np.ix_(slow, slow)].T, rows[-1][:, slow].T).T
+    return qr_triangle(np.vstack([*rows[:-1], tail @ np.eye(len(A))[slow]]))

@@ -5,7 +5,7 @@ A sample is judged by itself, before the observer sees it:
 | what arrives | what the observer takes | status |
 |---|---|---|
 | a measurement that is missing or not finite | nothing: it corrects nothing | `MISSING` |
-| an input that is not finite | the last good one, zero before the first; five samples on with its slope | `INVALID_INPUT` |
+| an input that is not finite | the last good one, five samples on with its slope; zero before | `INVALID_INPUT` |
 | a sample beyond a declared limit | the limit | `LIMIT` |
 | a sample beyond 1.5 times its range | as if it were missing, or not finite | `LIMIT` |
 

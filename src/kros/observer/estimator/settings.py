@@ -93,8 +93,8 @@ class EstimatorSettings(Settings):
     halves: tuple[float, ...] = Field(
         (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
         min_length=1,
-        description="ages of a gap at which the readout after losses and the fallback count one half, in longest delays; "
-        "training chooses",
+        description="ages of a gap at which the readout after losses and the fallback count one half, in longest "
+        "delays; training chooses",
     )
     room: float = Field(
         0.25,

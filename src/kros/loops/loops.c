@@ -68,7 +68,7 @@ typedef struct {
     const double *start;      /* (filters, n_lifted + n_inputs) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
     const double *half;       /* (kinds, recorded) */
-    const double *recovery;   /* (2): of losses and of a start */
+    const double *recovery;   /* (2): of the readout after losses, and of the fallback and a start */
     double *gap;              /* (kinds recorded + 3 q + 2 + q filters, batch): ages, counts of missing, refused and believed, ages of the last and the first start, ramps; moved on */
     double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
@@ -377,7 +377,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, vec *
             for (whole i = 0; i < recorded; i++) {
                 const whole at = (k * recorded + i) * MOST + v;
                 const vec oldest = (vec){0} + OLDEST * s->half[k * recorded + i], old = gap[at];
-                const vec recovered = either(lost, old, s->recovery[0] * either(old > oldest, oldest, old));
+                const vec recovered = either(lost, old, s->recovery[k % 2] * either(old > oldest, oldest, old));
                 gap[at] = either(gone > recovered, gone, recovered);
             }
         }

@@ -13,8 +13,8 @@ tends to :math:`x^u`; estimates in which the fallback counts already change it l
 measurements that have all arrived pull o by :math:`L (y - x^u - o)`, with L the regression of distances on those of
 measurements by a covariance X. As :math:`F X F' \le X`, F and :math:`I - L C` are contractions in one norm: by turns,
 they let no o grow. The age a of a gap is the number of samples that are missing so far; when measurements return it
-falls by a factor :math:`\mu` a sample, counted as :math:`0.1 e^5 T` at most, so that m is below one percent as soon as
-no delay reaches back to what stood for them. Of several measurements, gaps of all and gaps of some have ages and T of
+falls by a factor a sample, counted as :math:`0.1 e^5 T` at most, so that m is below one percent as soon as the filters
+have forgotten what stood for them, as after a start. Of several measurements, gaps of all and gaps of some have ages and T of
 their own, and the larger m counts. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
@@ -22,8 +22,8 @@ their own, and the larger m counts. The estimate of a state that is not measured
 After a start, what happened before is not known; after a loss, filters hold what stood for measurements.
 :math:`x + m (x^s - x)` takes the place of x, with T = 1 and an age of :math:`0.1 e^5` at a start, and then
 :math:`x + m (x^l - x)`, with ages like those of the fallback and H in place of T, least for what stands for
-measurements. Limits of the estimates hold before the fallback enters them, so that little of what is far away is left
-in long gaps.
+measurements; these fall until no delay reaches back to a loss. Limits of the estimates hold before the fallback enters
+them, so that little of what is far away is left in long gaps.
 
 A measurement is refused, and counts as missing, where it is further from its estimate than :math:`b (1 + w / (1 + k))
 (1 + g)^2 (1 + r)`. Here b is the gate, k are the measurements that were believed since a start, and g and r the samples
@@ -58,7 +58,7 @@ class FilterBank:
     filters: int
     start: Array
     half: Array  # (2 or 4, n), H and T of losses of all measurements and, of several, of losses of some
-    recovery: Array  # (2,), of losses and of a start
+    recovery: Array  # (2,), of the readout after losses, and of the fallback and a start
     reach: Array
     gate: Array
     opening: Array  # (q,), w
@@ -178,7 +178,8 @@ class Gaps:
         count = np.where(missing, self.count + 1, 0.0)
         pairs = (none, some), (count.min(axis=1), count.max(axis=1) * ~none)
         lost, lengths = (np.stack(p, axis=1)[..., None].repeat(2, axis=1)[:, : len(bank.half)] for p in pairs)
-        recovered = np.where(lost, self.age, bank.recovery[0] * np.minimum(self.age, OLDEST * bank.half))
+        rates = np.tile(bank.recovery, len(bank.half) // 2)[:, None]
+        recovered = np.where(lost, self.age, rates * np.minimum(self.age, OLDEST * bank.half))
         self.age[...] = np.maximum(recovered, lengths)
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]
         recorded += level(self.start[:, :1]) * (following[:, self.after_start] - recorded)

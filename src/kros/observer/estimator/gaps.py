@@ -183,7 +183,8 @@ def blended_errors(missing: Flags, signals: Sequence[Array], F: Array, bank: Fil
         offset = (offset + (1 - share) * (x - from_inputs[k] - offset)) @ F.T
         count = np.where(lost, count + 1, 0.0)
         age = np.maximum(
-            np.where(lost[:, None], age, bank.recovery[0] * np.minimum(age, OLDEST * half)), count[:, None]
+            np.where(lost[:, None], age, bank.recovery[:, None, None, None] * np.minimum(age, OLDEST * half)),
+            count[:, None],
         )
         after, blend = level(age, half)
         x = filtered[k + 1] + fading * after * (after_loss[k + 1] - filtered[k + 1])

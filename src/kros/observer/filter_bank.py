@@ -14,8 +14,8 @@ measurements that have all arrived pull o by :math:`L (y - x^u - o)`, with L the
 measurements by a covariance X. As :math:`F X F' \le X`, F and :math:`I - L C` are contractions in one norm: by turns,
 they let no o grow. The age a of a gap is the number of samples that are missing so far; when measurements return it
 falls by a factor a sample, counted as :math:`0.1 e^5 T` at most, so that m is below one percent as soon as the filters
-have forgotten what stood for them, as after a start. Of several measurements, gaps of all and gaps of some have ages and T of
-their own, and the larger m counts. The estimate of a state that is not measured is
+have forgotten what stood for them, as after a start. Of several measurements, gaps of all and gaps of some have ages
+and T of their own, and the larger m counts. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (x^u_{k+1} + o_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 

@@ -178,7 +178,7 @@ class Gaps:
         count = np.where(missing, self.count + 1, 0.0)
         pairs = (none, some), (count.min(axis=1), count.max(axis=1) * ~none)
         lost, lengths = (np.stack(p, axis=1)[..., None].repeat(2, axis=1)[:, : len(bank.half)] for p in pairs)
-        rates = np.tile(bank.recovery, len(bank.half) // 2)[:, None]
+        rates = np.resize(bank.recovery, (len(bank.half), 1))
         recovered = np.where(lost, self.age, rates * np.minimum(self.age, OLDEST * bank.half))
         self.age[...] = np.maximum(recovered, lengths)
         fallback, recorded = following[:, self.from_inputs] + following[:, self.offset], following[:, : self.recorded]

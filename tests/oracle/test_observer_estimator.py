@@ -1,4 +1,4 @@
-"""The filter-bank estimator against what is known otherwise: its system, least squares, exact plants, and straight lines over gaps."""
+"""The filter-bank estimator against what is known otherwise: its system, least squares, exact plants, and conditional means over losses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.linalg
 from batches import batch_of, run_with_status
 from machines import filters
 from recorded_plant import DT, FEW, LIFTING, estimator, plant, recorded_motors
@@ -29,7 +28,6 @@ from kros.observer import (
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
-from kros.observer.estimator.gaps import decay, pull_of
 from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Moments, Readout, Whitening, condition_weights
 from kros.observer.estimator.rows import Design
@@ -115,8 +113,8 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     made = design(recordings)
     whitening = Whitening.of(made, made.sample())
     (moments,) = Moments.of([made], [whitening])
-    penalty, start, share, bridge = 1e-6, 0.2, 0.1, 0.05
-    (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, start, share, bridge)])
+    penalty, start, share = 1e-6, 0.2, 0.1
+    (found,) = moments.solved(np.ones(len(moments.groups)), [(penalty, start, share)])
     parts: dict = {}
     for key, rows, targets, weights in made.rows(recordings, FEW.rows):
         parts.setdefault(made.groups[key], []).append((rows @ whitening.directions, targets, weights))
@@ -126,7 +124,6 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
         X += [F * np.sqrt(w)[:, None] / size for F, _, w in own]
         T += [t * np.sqrt(w)[:, None] / size for _, t, w in own]
     errors = whitening.trust + start * whitening.elsewhere + share * whitening.disturbed
-    errors += bridge * whitening.bridges
     prior = errors + penalty * np.diag(whitening.penalty)
     root = np.linalg.cholesky(prior).T
     stacked = np.vstack([*X, root]), np.vstack([*T, np.zeros((len(root), 3))])
@@ -205,7 +202,7 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     made = design(alone, settings=settings)
     whitening = Whitening.of(readout.design, readout.design.sample())
     (moments,) = Moments.of([made], [whitening])
-    weights = 1e-8, 0.0, settings.settled_share, 0.0
+    weights = 1e-8, 0.0, settings.settled_share
     (coefficients,) = moments.solved(np.ones(len(moments.groups)), [weights])
     group = readout.design.groups[key]
     np.testing.assert_allclose(
@@ -218,12 +215,10 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
 
 def test_left_out_errors_are_those_of_penalties_that_other_units_chose():
     recordings, _ = plant(units=4, episodes=2, spread=0.6)
-    made = design(
-        recordings, settings=FEW.model_copy(update={"parts": 1, "rows": 1000, "sample": 1000, "gap_share": 1e-3})
-    )
+    made = design(recordings, settings=FEW.model_copy(update={"parts": 1, "rows": 1000, "sample": 1000}))
     (readout,), (moments,) = Readout.of([made]), Moments.of([made], [Whitening.of(made, made.sample())])
     settings, weights = made.settings, condition_weights(moments, made.settings.restart_share)
-    candidates = [(penalty, 0.0, settings.settled_share, 0.0) for penalty in settings.penalties]
+    candidates = [(penalty, 0.0, settings.settled_share) for penalty in settings.penalties]
     others, folds = moments.without(weights, candidates), moments.of_groups("fold")
     errors = np.array([[moments.errors(c)[i] for c in others[g]] for i, g in enumerate(moments.groups)])
     differing = 0
@@ -267,27 +262,6 @@ def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     assert (errors[1] < 0.5 * errors[0]).all()
 
 
-@pytest.mark.parametrize("gap", [1, 7, 40])
-def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
-    observer = exact[0].observer
-    assert observer.bank is not None
-    bank = replace(observer.bank, half=np.full((2, 3), 1e12), reach=np.zeros(3), gate=np.full(1, np.inf))
-    A, B, n = observer.A.copy(), observer.B.copy(), observer.lifting.n_states
-    A[n - 6 : n], B[n - 6 : n] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses it linearly
-    A[n - 3 : n, n - 3 : n] = np.eye(3)
-    for own in (slice(n - 12, n - 9), slice(n - 9, n - 6)):
-        A[own], B[own] = A[:3], B[:3]  # one readout for all time
-    observer = replace(observer, bank=bank, A=A, B=B)
-    y, u = np.linspace(0.0, 2.0, 200)[:, None, None], np.zeros((200, 1, 1))
-    lost = y.copy()
-    lost[100 : 100 + gap] = np.nan
-    found, wanted = (run_observer(observer, given, u) for given in (lost, y))
-    after = slice(101 + gap, None)
-    size = np.abs(wanted[after, 0, :3]).max(axis=0)
-    np.testing.assert_allclose(found[after, 0, :3] / size, wanted[after, 0, :3] / size, atol=1e-8)
-    assert not np.allclose(found[101 : 100 + gap + 1, 0, :3], wanted[101 : 100 + gap + 1, 0, :3])
-
-
 @pytest.mark.parametrize("size", [0.02, 0.1, 1.0])
 def test_wrong_samples_are_taken_as_missing(motors, size):
     observer, batch = motors
@@ -326,15 +300,6 @@ def test_a_sensor_that_is_wrong_for_long_is_believed_again_and_its_fault_forgott
     size = np.abs(batch.states).max(axis=(0, 1))
     assert (np.sqrt(np.mean((found[last] - wanted[last]) ** 2, axis=(0, 1))) < 0.05 * size).all()
     assert observer.bank.patience < 500
-
-
-def test_a_measurement_that_is_believed_after_refusals_begins_a_start(motors):
-    observer, batch = motors
-    course, y = Course(observer, batch.states.shape[1]), batch.states[..., :1].copy()
-    y[200:] += 0.05 * np.abs(y).max()
-    course.take(y, batch.inputs)
-    gaps, slow = course.steps.gaps, observer.bank.recovery[1]
-    assert (gaps.start[:, 0] > 100 * slow ** len(y)).all()
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 0.9, 0.95])
@@ -408,7 +373,7 @@ def test_estimates_stay_inside_declared_limits():
     free, limited = (
         run_observer(estimator(*parts, settings=one), batch.measurements([0]), batch.inputs) for one in (FEW, declared)
     )
-    np.testing.assert_array_equal(limited[..., 2], np.clip(free[..., 2], -top, top))
+    np.testing.assert_array_equal(limited[2:, :, 2], np.clip(free[2:, :, 2], -top, top))  # a start has a fallback
     np.testing.assert_array_equal(limited[..., :2], free[..., :2])
     for limits in ({"torque": (0.0, 1.0)}, {"current": (1.0, 0.0)}):
         wrong = FEW.model_copy(update={"limits": limits})
@@ -484,31 +449,95 @@ def test_a_machine_that_follows_its_reference_starts_at_rest_elsewhere_as_well()
     for shares in ({"start_share": 1e-12, "restart_share": 1e-12}, {}):
         chosen = EstimatorSettings(delays=16, rows=6000, gap_samples=1200, **shares)
         observer = estimator(recordings, Lifting(("position", "velocity")), settings=chosen)
+        observer = replace(observer, bank=replace(observer.bank, doubt=0 * observer.bank.doubt))  # it is known to rest
         unseen = [b for key, b in batches.items() if key.episode == "5"]
         off = [run_observer(observer, b.states[..., :1], b.inputs)[:50, 0, 1] - b.states[:50, 0, 1] for b in unseen]
         errors.append(np.sqrt(np.mean(np.square(off))))
     assert errors[1] < 0.4 * errors[0]
 
 
-@pytest.mark.parametrize("gap", [1, 20])
-def test_readouts_of_their_own_count_after_a_start_and_after_every_loss(motors, gap):
+def conditioned(observer, y, lost):
+    """The filters' states before every sample as means of all errors of one step, given what has arrived: with no recursion over gaps."""
+    bank, n, r = observer.bank, 3, observer.bank.filters
+    at, rows = list(observer.measured), [*range(n), *range(n, n + r)]
+    A, B = observer.A[rows], observer.B[rows, -1]
+    count, q = y.shape
+    first = Course(observer).take(y[:1, None], np.zeros((1, 1, 2))).estimates[0, 0]
+    z, known = first[n : n + r].copy(), y[0].copy()  # means without errors, and how they follow from errors
+    by_z, by_y = np.zeros((r, count * q)), np.zeros((q, count * q))
+    seen, wanted, found, variance = [], [], [], np.tile(bank.noise**2, count)
+    for k in range(count):
+        if k:
+            arrived = ~lost[k]
+            seen += list(by_y[arrived])
+            wanted += list(y[k, arrived] - known[arrived])
+        H = np.array(seen).reshape(-1, count * q)
+        error = (
+            variance * (H.T @ np.linalg.lstsq(H * variance @ H.T, np.array(wanted), rcond=None)[0])
+            if seen
+            else np.zeros(count * q)
+        )
+        found.append((z + by_z @ error, known + by_y @ error))
+        x = A[:, n : n + r] @ z + A[:, at] @ known + B
+        by_x = A[:, n : n + r] @ by_z + A[:, at] @ by_y
+        z, known, by_z, by_y = x[n:], x[at], by_x[n:], by_x[at].copy()
+        if k + 1 < count:
+            by_y[:, (k + 1) * q : (k + 2) * q] += np.eye(q)
+    return found
+
+
+@pytest.mark.parametrize("measured", [(0,), (0, 2)])
+def test_filters_after_losses_are_what_all_that_has_arrived_says(measured):
+    """Without functions and inputs, the recursion gives the conditional means of a Gaussian vector."""
+    observer = filters(functions=(), measured=measured)
+    bank = observer.bank
+    closed = dict.fromkeys(("reach", "rest", "gate"), np.full(len(measured), 1e6))
+    A, B = observer.A.copy(), observer.B.copy()
+    A[6:9], B[6:9] = A[:3], B[:3]  # one readout for all time
+    observer = replace(observer, A=A, B=B, bank=replace(bank, doubt=np.zeros((2, 2)), **closed))
+    rng, count = np.random.default_rng(5), 40
+    y, lost = rng.normal(size=(count, len(measured))), rng.random((count, len(measured))) < 0.6
+    lost[:2], lost[15:25] = False, True
+    found = Course(observer).take(np.where(lost, np.nan, y)[:, None], np.zeros((count, 1, 2))).estimates[:, 0]
+    for k, (z, known) in list(enumerate(conditioned(observer, y, lost)))[2:]:
+        # what arrived at k itself enters at the next sample
+        if not lost[k].all():
+            continue
+        np.testing.assert_allclose(found[k, 3:5], z, atol=1e-8)
+        np.testing.assert_allclose(found[k, list(measured)], known, atol=1e-8)
+
+
+def test_a_start_in_motion_is_known_after_few_samples():
+    """An undamped oscillator by its position: where the filters start does not matter after as many samples as it has states, if doubted."""
+    lifting, rng = Lifting(("position", "velocity")), np.random.default_rng(3)
+    recordings, _ = from_rest(list(rng.uniform(-2, 2, 6)), 1)
+    unseen = from_rest(list(rng.uniform(-2, 2, 4)), 2)[1]
+    observer = estimator(recordings, lifting, settings=EstimatorSettings(delays=16, rows=6000, gap_samples=1200))
+    errors = []
+    for doubt in (0.0, 1.0):
+        one = replace(
+            observer, bank=replace(observer.bank, doubt=doubt * observer.bank.doubt, rest=observer.bank.rest / 5)
+        )
+        runs = [
+            (run_observer(one, b.states[150:, :, :1], b.inputs[150:])[:, 0, 1], b.states[150:, 0, 1])
+            for b in unseen.values()
+        ]
+        errors.append(np.sqrt(np.mean([(x - v)[5:50] ** 2 for x, v in runs])))
+    assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize("pattern", [(10, 1), (10, 10), (20, 2), (20, 5), (100, 5)])
+def test_regular_losses_cost_no_more_than_the_loss_of_everything(motors, pattern):
     observer, batch = motors
-    y, n = batch.states[..., :1].copy(), observer.lifting.n_states
-    y[300 : 300 + gap] = np.nan
-    runs, last, half = [], 299 + gap, np.array([[0.1, 2.0, 2.0], [1e12, 1e12, 1e12]])
-    for factor in (0.0, 1.0):
-        A, B = observer.A.copy(), observer.B.copy()
-        share = np.array([1.0, factor, factor])[:, None]  # substitutes are the same: the position
-        for own in (slice(n - 12, n - 9), slice(n - 9, n - 6)):
-            A[own], B[own] = share * A[:3], share * B[:3]
-        bank = replace(observer.bank, half=half, gate=np.full(1, np.inf))
-        one = replace(observer, A=A, B=B, bank=bank)
-        runs.append(run_observer(one, y, batch.inputs)[last + 2 :, :, 1])
-    oldest, since = 0.1 * np.exp(5), np.arange(1, len(y) - last - 1)[:, None]
-    fast, slow = observer.bank.recovery
-    loss, start = min(gap / 2, oldest) * fast**since, oldest * slow ** (since + last)
-    wanted = runs[1] / (1 + start**2) / (1 + loss**2)
-    np.testing.assert_allclose(runs[0], wanted, atol=1e-9 * np.abs(runs[1]).max())
+    y, (gone, there) = batch.states[..., :1].copy(), pattern
+    lost, size = np.arange(len(y)) % (gone + there) < gone, np.abs(batch.states).max(axis=(0, 1))
+    lost[:100] = False
+    errors = []
+    for some in (lost, np.arange(len(y)) >= 100):
+        shown = np.where(some[:, None, None], np.nan, y)
+        apart = run_observer(observer, shown, batch.inputs)[100:, :, 1:3] - batch.states[100:, :, 1:3]
+        errors.append(np.sqrt(np.mean(apart**2, axis=(0, 1))) / size[1:3])
+    assert (errors[0] < 1.2 * errors[1]).all()
 
 
 def test_candidates_are_compared_without_groups_in_which_a_state_rests():
@@ -516,44 +545,13 @@ def test_candidates_are_compared_without_groups_in_which_a_state_rests():
     made = design(recordings, settings=FEW.model_copy(update={"parts": 3}))
     (moments,) = Moments.of([made], [Whitening.of(made, made.sample())])
     parts = moments.of_groups("part")
-    errors = np.zeros((len(parts), 6, 3))
-    errors[:, 3:] = 0.1  # the other penalty is no better
-    errors[parts < 2, 3:, 0] = -60.0  # but where the first state is zero
+    errors = np.zeros((len(parts), 4, 3))
+    errors[:, 2:] = 0.1  # the other penalty is no better
+    errors[parts < 2, 2:, 0] = -60.0  # but where the first state is zero
     resting = replace(moments, power=np.where((parts < 2)[:, None] & (np.arange(3) == 0), 0.0, 1.0))
-    np.testing.assert_array_equal(resting.best(np.exp(errors)), np.repeat([0, 1, 2], 3))
-    errors[:, 3:] = -0.3
-    np.testing.assert_array_equal(resting.best(np.exp(errors)), np.repeat([3, 4, 5], 3))
-
-
-def test_what_machines_do_that_are_let_go_is_found_from_noisy_distances():
-    rng = np.random.default_rng(1)
-    F, decays = np.zeros((3, 3)), np.empty((3000, 8, 3))
-    F[:2, :2] = np.exp(-0.01) * np.array([[np.cos(0.1), np.sin(0.1)], [-np.sin(0.1), np.cos(0.1)]])
-    F[2, 2] = 0.97
-    decays[0] = rng.normal(size=(8, 3))
-    for k in range(2999):
-        decays[k + 1] = decays[k] @ F.T + 0.1 * rng.normal(size=(8, 3))
-    found = decay(decays + 0.05 * rng.normal(size=decays.shape), [1, 2])
-    np.testing.assert_allclose(np.linalg.matrix_power(found, 20), np.linalg.matrix_power(F, 20), atol=0.1)
-    apart = np.concatenate([decays[..., 2:], np.cumsum(decays[..., 2:], axis=0)], axis=-1)  # an integrator
-    assert np.abs(np.linalg.eigvals(decay(apart, [0]))).max() <= 1.0
-
-
-def test_no_order_of_decay_and_correction_makes_distances_grow():
-    """Two masses, one of them measured: F is stable, and its part for the others is not."""
-    rng, k = np.random.default_rng(0), 40.0
-    A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-2 * k, k, -0.6, 0.3], [k, -k, 0.3, -0.6]])
-    mix, apart = np.eye(4) + 0.5 * rng.normal(size=(4, 4)), np.zeros((20_000, 1, 4))
-    F = mix @ scipy.linalg.expm(0.05 * A) @ np.linalg.inv(mix)
-    for k in range(len(apart) - 1):
-        apart[k + 1] = apart[k] @ F.T + rng.normal(size=4)
-    rms, largest = np.sqrt((apart**2).mean(axis=(0, 1))), []
-    for pull in (pull_of(F, apart, rms, [0])[:, 0], np.eye(4)[0]):
-        distances = [rms]
-        for arrives in rng.random(900) < np.repeat([0.1, 0.5, 0.9], 300):
-            distances.append(F @ (distances[-1] - pull * distances[-1][0] * arrives))
-        largest.append(np.abs(distances / rms).max())
-    assert largest[0] < 10 < 1e3 < largest[1]
+    np.testing.assert_array_equal(resting.best(np.exp(errors)), np.repeat([0, 1], 3))
+    errors[:, 2:] = -0.3
+    np.testing.assert_array_equal(resting.best(np.exp(errors)), np.repeat([2, 3], 3))
 
 
 def test_gaps_of_pendulums_are_no_worse_than_the_model_alone():
@@ -599,24 +597,7 @@ def test_one_of_two_sensors_that_is_lost_for_ever_leaves_the_estimate_bounded(tw
     size = np.abs(batch.states).max(axis=(0, 1))
     y[200:-200, :, lost] = np.nan
     estimate = run_observer(observer, y, u)[..., :3]
-    assert (np.abs(estimate) < 3 * size).all()
-
-
-def test_gaps_are_bridged_by_straight_lines_through_functions_too():
-    # The filters after a gap are those of measurements along the line, but for the square of how far it moves them.
-    bank = filters()
-    bank = replace(bank, bank=replace(bank.bank, reach=np.full(3, 1e3)))
-    rng, length, begin, apart = np.random.default_rng(0), 12, 20, []
-    y, u = 0.1 * rng.normal(size=(40, 1, 1)), rng.normal(size=(40, 1, 2))
-    y[begin : begin + length] = np.nan
-    expected = Course(bank).take(y, u).estimates[:, 0, 0]
-    for jump in (1e-5, 5e-6):
-        y[begin + length] = expected[begin + length] + jump * (length + 1)
-        line = y.copy()
-        line[begin : begin + length, 0, 0] = expected[begin : begin + length] + jump * np.arange(1, length + 1)
-        after, wanted = (Course(bank).take(one, u).estimates[begin + length + 1, 0, 3:5] for one in (y, line))
-        apart.append(np.abs(after - wanted))
-    np.testing.assert_allclose(apart[0] / apart[1], 4.0, rtol=0.1)
+    assert (np.abs(estimate) < 4 * size).all()  # a range from what inputs say
 
 
 @pytest.mark.parametrize("late", [[0], [1], [0, 1]])
@@ -626,9 +607,9 @@ def test_filters_start_at_the_first_sample_with_all_measurements_and_those_of_in
     wanted, whole = (Course(observer, y.shape[1]).take(y[k:], u[k:]).estimates for k in (30, 0))
     y[:30, :, late] = np.nan
     found = Course(observer, y.shape[1]).take(y, u).estimates
-    filters, inputs = slice(n, n + observer.bank.filters), slice(n + observer.bank.filters, -4 * n)
+    filters, inputs = slice(n, n + observer.bank.filters), slice(n + observer.bank.filters, -2 * n)
     for part, other in ((filters, wanted[1:]), (inputs, whole[31:])):
         scale = np.abs(other[..., part]).max()
         np.testing.assert_allclose(found[31:, :, part], other[..., part], atol=1e-8 * scale)
-    velocity, from_inputs, offset = (found[1:31, :, k] for k in (1, 1 - 2 * n, 1 - n))
-    np.testing.assert_allclose(velocity, from_inputs + offset, atol=1e-9 * np.abs(velocity).max())
+    velocity, from_inputs = (found[1:31, :, k] for k in (1, 1 - n))
+    np.testing.assert_allclose(velocity, from_inputs, atol=1e-9 * np.abs(velocity).max())

@@ -119,14 +119,14 @@ def test_a_recording_in_blocks_is_run_as_a_whole(kind, delay, loops, monkeypatch
         K_l = StateSpace(K.A, K.B, np.vstack([K.C, [[0.0], [0.0]]]), np.vstack([K.D, [[0.0], [0.0]]]), DT)
         o = Observer("h", lifting, A_l, 0.01 * B_l, (0,), ("u",), K_l, Injection.STATE, DT, runtime=Runtime(delay))
     elif kind == "bank":
-        A_b = np.zeros((13, 13))
+        A_b = np.zeros((9, 9))
         A_b[:2, [0, 2]], A_b[2:4, 0], A_b[2:4, 2:4] = [[0.9, 0.1], [0.2, 0.5]], 0.1, np.diag([0.8, 0.5])
-        A_b[4, 4], A_b[5:9, 2], A_b[9:11, 4], A_b[11:, 11:] = 0.9, 0.2, 0.3, [[0.9, 0.1], [-0.1, 0.8]]
-        of_gaps = map(np.array, ([0.5, 0.95], [0.2, 0.5], [0.5], [4.0], [[1.0], [0.3]]))
-        bank = FilterBank(2, 0.1 * np.ones((13, 14)), np.full((2, 2), 20.0), *of_gaps)
-        lifting = Lifting(("x", "v", "z1", "z2", "w", "xs", "vs", "xl", "vl", "xu", "vu", "xo", "vo"))
-        still = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((13, 0)), np.zeros((13, 1)), DT)
-        o = Observer("b", lifting, A_b, 0.1 * np.ones((13, 1)), (0,), ("u",), still, Injection.STATE, DT, bank=bank)
+        A_b[4, 4], A_b[5:7, 2], A_b[7:9, 4] = 0.9, 0.2, 0.3
+        of_gaps = map(np.array, ([0.95], [[0.2, 0.1], [0.1, 0.3]], [0.2, 0.5], [0.5], [0.05], [0.2], [0.5], [4.0]))
+        bank = FilterBank(2, 0.1 * np.ones((9, 10)), *of_gaps)
+        lifting = Lifting(("x", "v", "z1", "z2", "w", "xs", "vs", "xu", "vu"))
+        still = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((9, 0)), np.zeros((9, 1)), DT)
+        o = Observer("b", lifting, A_b, 0.1 * np.ones((9, 1)), (0,), ("u",), still, Injection.STATE, DT, bank=bank)
     else:
         o = unstable(runtime=Runtime(delay=delay, upper=np.array([2.5, np.inf])))
     if not loops:

@@ -63,10 +63,9 @@ MACHINES = {
 
 
 def filters(functions=GEAR, cut=False, measured=(0,)):
-    """A filter bank with two filters, one of inputs alone, and ages of gaps for every state."""
+    """A filter bank with two filters, and one of inputs alone."""
     parameters = ("phase",) if functions else ()
-    kinds = ("after_start", "after_loss", "from_inputs", "offset_from_inputs")
-    fallback = tuple(f"{name}_{what}" for what in kinds for name in STATES)
+    fallback = tuple(f"{name}_{what}" for what in ("error", "from_inputs") for name in STATES)
     states = (*STATES, "filter_1", "filter_2", "input_filter_1", *fallback)
     lifting = Lifting(states, functions, parameters, ("target", "rate"), ("rate*position", "1"))
     rng, n, p = np.random.default_rng(3), lifting.n_states, lifting.n_lifted
@@ -74,19 +73,17 @@ def filters(functions=GEAR, cut=False, measured=(0,)):
     seen, others = [*measured, *range(n, p)], [i for i in range(n) if i not in measured]
     A[:5, seen], B[:5] = 0.1 * rng.normal(size=(5, len(seen))), 0.1 * rng.normal(size=(5, 4))
     A[:5, 3:5] = [[0.1, 0.0], [0.5, 0.1], [0.0, 0.7], [0.9, 0.1], [-0.1, 0.9]]
-    A[0, 0] += 1.0
+    A[:5, n:] *= 0.01  # slopes of a gear are large
+    A[0, 0] += 0.8
     A[5, 5], B[5, [0, 1, 3]] = 0.95, [0.05, 0.01, 0.02]
     A[6:9, [0, 3, 4]] = [[0.9, 0.2, 0.1], [0.0, 0.1, 0.2], [0.1, 0.0, 0.1]]
-    A[9:12, [0, 3, 4]] = [[0.7, 0.1, 0.1], [0.1, 0.2, 0.1], [0.0, 0.1, 0.3]]
-    A[12:15, 5], B[12:15, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
-    A[15:18, 15:18] = [[0.99, 0.05, 0.0], [-0.05, 0.9, 0.02], [0.0, 0.1, 0.5]]
+    A[9:12, 5], B[9:12, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
     start = 0.1 * rng.normal(size=(n, p + 4))
     start[:, others] = 0.0  # states that are not measured are not known
-    start[15:18] = 0.0
-    q = len(measured)  # ages of losses of all and of some, of the readout after losses and of the fallback
-    half = [[0.1, 2.0, 1.0], [5.0, 8.0, 2.0], [0.2, 1.0, 4.0], [9.0, 20.0, 7.0]]
-    ages = half[: 2 * q], [0.8, 0.95], [0.02, 0.4, 0.5], [1.0, 2.0][:q]
-    bank = FilterBank(2, start, *map(np.array, ages), np.linspace(2.0, 5.0, q), np.full((3, q), 0.2))
+    q = len(measured)
+    doubt, half = np.array([[0.02, 0.01], [0.01, 0.03]]), np.array([0.1, 0.05, 0.2])
+    of_measurements = (np.array(row[:q]) for row in ([0.5, 0.8], [0.02, 0.03], [0.1, 0.2], [1.0, 2.0], [2.0, 5.0]))
+    bank = FilterBank(2, start, np.array([0.95]), doubt, half, *of_measurements)
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, q)), np.zeros((p, 0)), np.zeros((p, q)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))
     first = np.append([0.4, 0.1, -0.1], np.zeros(n - 3))

@@ -120,25 +120,24 @@ def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> No
 
 def filters(**changes: Any) -> Observer:
     """A filter bank of one filter, and no filter of inputs."""
-    own = ("after_start", "after_loss", "from_inputs", "offset_from_inputs")
-    lifting = Lifting(("position", "filter_1", *(f"position_{what}" for what in own)), (), (), ("torque",), ("1",))
-    ones = dict.fromkeys(("reach", "gate", "opening"), np.ones(1))
-    bank = {"filters": 1, "start": np.ones((6, 8)), "recovery": np.array([0.5, 0.9]), **ones}
-    bank |= {"half": np.ones((2, 1)), "pull": np.ones((1, 1))}
-    none, made = gain(np.zeros((6, 1)), 0.01), FilterBank(**bank | changes)
+    states = ("position", "filter_1", "position_error", "position_from_inputs")
+    lifting = Lifting(states, (), (), ("torque",), ("1",))
+    ones = dict.fromkeys(("half", "reach", "noise", "rest", "gate", "opening"), np.ones(1))
+    bank = {"filters": 1, "start": np.ones((4, 6)), "recovery": np.array([0.9]), "doubt": np.eye(1), **ones}
+    none, made = gain(np.zeros((4, 1)), 0.01), FilterBank(**bank | changes)
     return Observer(
-        "f", lifting, 0.5 * np.eye(6), np.ones((6, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=made
+        "f", lifting, 0.5 * np.eye(4), np.ones((4, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=made
     )
 
 
 @pytest.mark.parametrize(
     ("changes", "error", "match"),
     [
-        ({"recovery": np.array([0.5, 1.5])}, DataError, "between 0 and 1"),
-        ({"recovery": np.ones(1)}, DimensionError, "recovery"),
-        ({"half": np.zeros((2, 1))}, DataError, "half should be positive"),
-        ({"start": np.ones((2, 7))}, DimensionError, "start"),
-        ({"filters": 4}, DimensionError, "at most 1 filters of measurements; found .* 4 filters"),
+        ({"recovery": np.array([1.5])}, DataError, "between 0 and 1"),
+        ({"recovery": np.ones(2)}, DimensionError, "recovery"),
+        ({"half": np.zeros(1)}, DataError, "half should be positive"),
+        ({"start": np.ones((2, 5))}, DimensionError, "start"),
+        ({"filters": 4, "doubt": np.eye(4)}, DimensionError, "at most 1 filters of measurements; found .* 4 filters"),
     ],
 )
 def test_a_filter_bank_that_does_not_fit_is_refused(
@@ -150,4 +149,4 @@ def test_a_filter_bank_that_does_not_fit_is_refused(
 
 def test_a_filter_bank_has_no_correction() -> None:
     with pytest.raises(DimensionError, match="has no correction"):
-        replace(filters(), controller=gain(np.ones((6, 1)), 0.01))
+        replace(filters(), controller=gain(np.ones((4, 1)), 0.01))

@@ -152,6 +152,6 @@ def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
     """Return the samples in which a start is forgotten, by the slowest mode of a linear part or of a bank's filters."""
     radius = float(noise_response(observer).spectral_radius())
     if observer.bank is not None:
-        radius = max(radius, *observer.bank.recovery)
+        radius = max(radius, observer.bank.recovery[0])
     samples = settings.settle[1] if radius >= 1 else np.log(settings.forgotten) / np.log(max(radius, ITERATED))
     return int(np.clip(np.ceil(samples), *settings.settle)) + observer.runtime.delay

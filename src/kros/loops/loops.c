@@ -48,8 +48,7 @@ typedef struct {
     whole q;
     whole own;         /* every machine has a map of its own: map (batch, rows, columns) */
     whole fresh;       /* earlier values equal the present ones at the first sample */
-    whole recorded;    /* first states; the last ones are those after a start, those from inputs alone, and how far apart they are; none */
-    whole kinds;       /* of ages, in pairs of the second readout and the fallback: of losses of all measurements, and of some */
+    whole recorded;    /* first states; the last ones are those after a start, then their errors, and those from inputs alone; none */
     whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
     whole patience;    /* measurements refused in a row, after which one is believed */
     const double *map;        /* (n + order, n_lifted + order + n_inputs + q) */
@@ -61,15 +60,17 @@ typedef struct {
     uint8_t *left;            /* (1): whether a machine would leave the bounds; all numbers are then of no use */
     double *column;           /* (columns, batch): x and c in their rows, moved on */
     double *past;             /* (batch, earlier), moved on */
-    const double *reach;      /* (recorded) */
+    const double *reach;      /* (q) */
+    const double *noise;      /* (q): errors of one step */
+    const double *rest;       /* (q): errors of a first step where nothing has moved before */
     const double *gate;       /* (q) */
     const double *opening;    /* (q): how much wider gates are after a start */
-    const double *pull;       /* (recorded, q) */
     const double *start;      /* (filters, n_lifted + n_inputs) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
-    const double *half;       /* (kinds, recorded) */
-    const double *recovery;   /* (2): of the readout after losses, and of the fallback and a start */
-    double *gap;              /* (kinds recorded + 3 q + 2 + q filters, batch): ages, counts of missing, refused and believed, ages of the last and the first start, ramps; moved on */
+    const double *half;       /* (recorded) */
+    const double *recovery;   /* (1) */
+    const double *doubt;      /* (filters, filters): covariance at a start */
+    double *gap;              /* (3 q + 1 + (filters + q)^2, batch): counts of refused and believed, widths of gates, age of the last start, covariance; moved on */
     double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
 
@@ -241,179 +242,207 @@ static vec clipped(vec value, vec low, vec high)
     return either(value < low, low, either(value > high, high, value));
 }
 
+static vec root(vec x) { for (whole b = 0; b < WIDE; b++) x[b] = sqrt(x[b]); return x; }
+
 #define OLDEST (0.1 * exp(5.0)) /* age of a start; twice as much until a sample has all measurements */
 
-static vec level(vec age, vec half)
-{
-    const vec ratio = age / half;
-    return ratio * ratio / (1.0 + ratio * ratio);
-}
+/* Gaps of a filter bank, see kros.observer.filter_bank for the symbols. */
+struct gaps {
+    vec *gap;          /* (3 q + 1): as in the job, */
+    vec *spread;       /* (MOST, filters + q, filters + q): and the covariance */
+    vec *by;           /* (recorded + filters, q): slopes by the measurements */
+    vec *moved;        /* (recorded + filters, filters + q): T P */
+    whole *columns;    /* (recorded + filters, filters): which filters every row of T has, */
+    whole *counts;     /* (recorded + filters) and how many */
+    mask *missing;     /* (q) */
+};
+#define SPREAD(I, J) spread[(I) * size + (J)]
 
-/* How much the readout after losses (0) or the fallback (1) counts for a state: the most of losses of all and of some measurements. */
-static vec counted(const relift_job *s, const vec *gap, whole at, whole which)
+/* Measurements, and estimates in place of missing ones, into states; the filters are corrected by what arrives. */
+static void fill(const relift_job *s, const struct gaps *g, vec *reg, vec *y, whole n, whole w)
 {
-    const vec start = gap[(s->kinds * s->recorded + 3 * s->q) * MOST + at % MOST];
-    vec most = either(start > OLDEST, (vec){0} + 1.0, (vec){0});
-    for (whole k = which; k < s->kinds; k += 2) {
-        const vec share = level(gap[k * s->recorded * MOST + at], (vec){0} + s->half[k * s->recorded + at / MOST]);
-        most = either(share > most, share, most);
-    }
-    return most;
-}
-
-/* Gaps of a filter bank, see kros.observer.filter_bank for the symbols: measurements and what stands for missing ones, into states; straight lines
-   over gaps that end. */
-static void fill(const relift_job *s, vec *gap, vec *reg, vec *y, mask *missing, whole n, whole w)
-{
-    const whole r = s->filters, recorded = s->recorded, ages = s->kinds * recorded;
-    const vec *from_inputs = reg + (n - 2 * recorded) * MOST;
-    vec *offset = reg + (n - recorded) * MOST;
+    const whole r = s->filters, q = s->q, recorded = s->recorded, size = r + q;
     for (whole v = 0; v < w; v++) {
-        vec *start = gap + (ages + 3 * s->q) * MOST + v;
+        vec *start = g->gap + 3 * q * MOST + v, *spread = g->spread + v * size * size, column[size];
         mask waits = *start > OLDEST, anew = {0}, complete = ~anew;
-        for (whole j = 0; j < s->q; j++) {
+        for (whole j = 0; j < q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
-            vec *refusals = gap + (ages + s->q) * MOST + row, *believed = refusals + s->q * MOST;
-            const vec seen = y[row], missed = 1.0 + gap[ages * MOST + row] - *refusals, apart = either(seen > reg[i], seen - reg[i], reg[i] - seen);
-            const vec close = s->gate[j] * (1.0 + s->opening[j] / (1.0 + *believed)), far = close * (missed * missed);
+            vec *refusals = g->gap + row, *believed = refusals + q * MOST, *width = believed + q * MOST;
+            const vec seen = y[row], apart = either(seen > reg[i], seen - reg[i], reg[i] - seen), wide = root(1.0 + SPREAD(r + j, r + j) / (s->noise[j] * s->noise[j]));
+            const vec near = s->gate[j] * (1.0 + s->opening[j] / (1.0 + *believed));
             const mask arrived = seen - seen == 0.0, outvoted = (*refusals >= (double)s->patience) | (*refusals >= *believed);
-            const mask refused = (apart > far * (1.0 + *refusals)) & ~outvoted & ~waits, starts = (apart > far) & (*refusals > 0.0) & ~refused & ~waits;
-            *believed = either(~refused & (apart > close), (vec){0}, *believed);
-            *start = either(starts, (vec){0} + OLDEST, *start);
-            anew |= starts & outvoted;
+            *width = either((*refusals > 0.0) & arrived, *width, wide);
+            const mask refused = (apart > near * *width * (1.0 + *refusals)) & ~waits & ~outvoted;
+            const mask starts = (apart > near * wide) & (*refusals > 0.0) & ~refused & ~waits;
+            *believed = either(starts, (vec){0}, *believed);
+            anew |= starts;
             *refusals = either(refused, *refusals + 1.0, either(arrived, (vec){0}, *refusals));
-            missing[row] = ~arrived | refused;
-            complete &= ~missing[row];
+            g->missing[row] = ~arrived | refused;
+            complete &= ~g->missing[row];
         }
         *start = either(anew & complete, (vec){0} + 2.0 * OLDEST, *start);
         waits = *start > OLDEST;
-        for (whole j = 0; j < s->q; j++) {
+        mask begins = complete & ~waits, still = complete;
+        for (whole j = 0; j < q; j++) {
+            const vec apart = y[j * MOST + v] - reg[s->measured[j] * MOST + v];
+            begins &= g->gap[(q + j) * MOST + v] == 1.0;
+            still &= (apart <= s->rest[j]) & (apart >= -s->rest[j]);
+        }
+        for (whole i = 0; i < size * size && any(begins); i++) spread[i] = either(begins & still, (vec){0}, spread[i]);
+        *start = either(begins & ~still, (vec){0}, *start);
+        for (whole j = 0; j < q; j++) {
+            const whole i = s->measured[j] * MOST + v, at = r + j;
+            const mask lost = g->missing[j * MOST + v] & ~waits, arrived = ~g->missing[j * MOST + v] & ~waits;
+            const vec variance = (vec){0} + s->noise[j] * s->noise[j];
+            mask uncertain = {0};
+            for (whole k = 0; k < size; k++) {
+                column[k] = SPREAD(k, at);
+                uncertain |= column[k] != 0.0;
+            }
+            if (any(uncertain & arrived)) {
+                const vec share = either(arrived, 1.0 / (column[at] + variance), (vec){0}), moved = share * either(arrived, y[j * MOST + v] - reg[i], (vec){0});
+                for (whole k = 0; k < r; k++) reg[(recorded + k) * MOST + v] += column[k] * moved;
+                for (whole k = 0; k < q; k++) reg[s->measured[k] * MOST + v] += column[r + k] * moved;
+                for (whole k = 0; k < size; k++)
+                    for (whole l = 0; l < size; l++) SPREAD(k, l) -= column[k] * column[l] * share;
+                for (whole k = 0; k < size; k++) SPREAD(k, at) = SPREAD(at, k) = either(arrived, (vec){0}, SPREAD(k, at));
+            }
+            SPREAD(at, at) += either(lost, variance, (vec){0});
+        }
+        for (whole j = 0; j < q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
-            const vec seen = y[row], count = gap[ages * MOST + row], held = from_inputs[i] + offset[i], reach = s->reach[s->measured[j]] * (1.0 + start[MOST]);
-            const vec near = clipped(reg[i] - held, -reach, reach);
-            const mask ends = ~missing[row] & ~waits & (count > 0.0);
-            const vec jump = either(ends, (seen - (held + near)) / (count + 1.0), (vec){0});
-            for (whole l = 0; l < r && any(ends); l++) reg[(recorded + l) * MOST + v] += gap[(ages + 3 * s->q + 2 + j * r + l) * MOST + v] * jump;
-            reg[i] = y[row] = either(missing[row], held + near, seen);
+            const vec fallback = reg[(n - recorded) * MOST + i], reach = (vec){0} + s->reach[j];
+            reg[i] = y[row] = either(g->missing[row], fallback + clipped(reg[i] - fallback, -reach, reach), y[row]);
         }
     }
-    vec innovation[s->q * MOST];
-    for (whole j = 0; j < s->q; j++)
-        for (whole v = 0; v < w; v++) {
-            const whole at = s->measured[j] * MOST + v;
-            innovation[j * MOST + v] = reg[at] - from_inputs[at] - offset[at];
-        }
-    for (whole i = 0; i < recorded; i++)
-        for (whole v = 0; v < w; v++) {
-            const whole at = i * MOST + v;
-            mask lost = {0};
-            int hidden = 1;
-            for (whole j = 0; j < s->q; j++) {
-                lost |= missing[j * MOST + v];
-                hidden &= s->measured[j] != i;
-            }
-            const vec share = either(lost, (vec){0}, 1.0 - hidden * counted(s, gap, at, 1));
-            vec pulled = offset[at];
-            for (whole j = 0; j < s->q; j++) pulled += s->pull[i * s->q + j] * either(lost, (vec){0}, innovation[j * MOST + v]);
-            const vec moved = pulled + share * (reg[at] - from_inputs[at] - pulled);
-            const double most = hidden ? s->reach[i] : INFINITY;
-            offset[at] = clipped(moved, (vec){0} - most, (vec){0} + most);
-        }
 }
 
 /* Filters start at the first sample that has all measurements. */
-static void restart(const relift_job *s, const formulas *f, vec *gap, vec *reg, vec *first, const mask *missing, whole w)
+static void restart(const relift_job *s, const formulas *f, const struct gaps *g, vec *reg, vec *first, whole w)
 {
-    const whole columns = f->n_lifted + f->n_inputs, ages = s->kinds * s->recorded;
+    const whole columns = f->n_lifted + f->n_inputs, q = s->q, size = s->filters + q;
     for (whole v = 0; v < w; v++) {
-        vec *start = gap + (ages + 3 * s->q) * MOST + v;
+        vec *start = g->gap + 3 * q * MOST + v, *spread = g->spread + v * size * size;
         mask begins = *start > OLDEST;
-        for (whole j = 0; j < s->q; j++) begins &= ~missing[j * MOST + v];
+        for (whole j = 0; j < q; j++) begins &= ~g->missing[j * MOST + v];
         if (!any(begins)) continue;
         for (whole i = 0; i < s->filters; i++) {
             first[i] = (vec){0};
             for (whole j = 0; j < columns; j++) first[i] += s->start[i * columns + j] * reg[f->lifted[j] * MOST + v];
         }
         for (whole i = 0; i < s->filters; i++) reg[(s->recorded + i) * MOST + v] = either(begins, first[i], reg[(s->recorded + i) * MOST + v]);
-        for (whole j = 0; j < s->q; j++) gap[(ages + 2 * s->q + j) * MOST + v] = either(begins, (vec){0}, gap[(ages + 2 * s->q + j) * MOST + v]);
+        for (whole j = 0; j < q; j++) g->gap[(q + j) * MOST + v] = either(begins, (vec){0}, g->gap[(q + j) * MOST + v]);
+        for (whole i = 0; i < size; i++)
+            for (whole k = 0; k < size; k++) {
+                const double doubt = i < s->filters && k < s->filters ? s->doubt[i * s->filters + k] : 0.0;
+                SPREAD(i, k) = either(begins, (vec){0} + doubt, SPREAD(i, k));
+            }
         *start = either(begins, (vec){0} + OLDEST, *start);
     }
 }
 
-/* The fallback into the next estimates; ages and ramps move on. */
-static void follow(const formulas *f, const vec *reg, const relift_job *s, vec *gap, vec *next, const mask *missing, vec *ramp, whole n, whole columns, whole w)
+/* The next covariance, and variances of the next recorded states in `variance`; false where all are zero. */
+static int spread_on(const formulas *f, const vec *reg, const relift_job *s, const struct gaps *g, vec *variance, whole columns, whole v)
 {
-    const whole r = s->filters, q = s->q, recorded = s->recorded, ages = s->kinds * recorded;
-    for (whole v = 0; v < w; v++) {
-        mask some = {0}, all = ~some;
-        vec longest = {0}, shortest = (vec){0} + INFINITY;
+    const whole r = s->filters, q = s->q, recorded = s->recorded, rows = recorded + r, size = r + q;
+    vec *spread = g->spread + v * size * size;
+    mask some = {0}, uncertain = {0}, lost = {0}, forgotten = ~some;
+    for (whole j = 0; j < q; j++) some |= g->missing[j * MOST + v];
+    for (whole i = 0; i < size; i++) uncertain |= SPREAD(i, i) != 0.0;
+    if (!any(some | uncertain)) return 0;
+    for (whole i = 0; i < rows; i++) {
+        const double *row = s->map + i * columns, *entry = row + recorded;
+        const whole *column = g->columns + i * r;
+        vec *by = g->by + i * q, *moved = g->moved + i * size, sum = {0};
         for (whole j = 0; j < q; j++) {
-            const mask lost = missing[j * MOST + v];
-            vec *count = gap + (ages + j) * MOST + v, *believed = count + 2 * q * MOST, *of = gap + (ages + 3 * q + 2 + j * r) * MOST + v;
-            const int moves = any(lost | (*count > 0.0));
-            *count = either(lost, *count + 1.0, (vec){0});
-            *believed += either(lost, (vec){0}, (vec){0} + 1.0);
-            longest = either(*count > longest, *count, longest);
-            shortest = either(*count < shortest, *count, shortest);
-            some |= lost;
-            all &= lost;
-            for (whole i = 0; i < r && moves; i++) {
-                const double *row = s->map + (recorded + i) * columns;
-                vec slope = (vec){0} + row[s->measured[j]], sum = {0};
-                for (const int32_t *by = f->slope; by < f->slope + 3 * f->slopes; by += 3)
-                    if (by[1] == j) slope += row[by[0]] * reg[by[2] * MOST + v];
-                for (whole l = 0; l < r; l++) sum += row[recorded + l] * of[l * MOST];
-                ramp[i] = sum + slope * *count;
-            }
-            for (whole i = 0; i < r && moves; i++) of[i * MOST] = either(lost, ramp[i], (vec){0});
+            by[j] = (vec){0} + row[s->measured[j]];
+            for (const int32_t *slope = f->slope; slope < f->slope + 3 * f->slopes; slope += 3)
+                if (slope[1] == j) by[j] += row[slope[0]] * reg[slope[2] * MOST + v];
         }
-        vec *start = gap + (ages + 3 * q) * MOST + v, *first = start + MOST;
-        const vec begun = level(*start, (vec){0} + 1.0), further = 1.0 + *first;
-        *start *= either(*start > OLDEST, (vec){0} + 1.0, (vec){0} + s->recovery[1]);
-        *first *= s->recovery[1];
-        for (whole k = 0; k < s->kinds; k++) {
-            const mask lost = k > 1 ? some : all;
-            const vec gone = k > 1 ? either(all, (vec){0}, longest) : shortest;
-            for (whole i = 0; i < recorded; i++) {
-                const whole at = (k * recorded + i) * MOST + v;
-                const vec oldest = (vec){0} + OLDEST * s->half[k * recorded + i], old = gap[at];
-                const vec recovered = either(lost, old, s->recovery[k % 2] * either(old > oldest, oldest, old));
-                gap[at] = either(gone > recovered, gone, recovered);
-            }
+        for (whole k = 0; k < size; k++) {
+            moved[k] = (vec){0};
+            for (whole l = 0; l < g->counts[i]; l++) moved[k] += entry[column[l]] * SPREAD(column[l], k);
+            for (whole j = 0; j < q; j++) moved[k] += by[j] * SPREAD(r + j, k);
         }
+        if (i >= recorded) continue;
+        for (whole l = 0; l < g->counts[i]; l++) sum += moved[column[l]] * entry[column[l]];
+        for (whole j = 0; j < q; j++) sum += moved[r + j] * by[j];
+        variance[i] = either(sum > 0.0, sum, (vec){0});
+    }
+    for (whole i = 0; i < recorded; i++) {
+        double least = s->half[i];
+        for (whole j = 0; j < q; j++)
+            if (s->measured[j] == i) {
+                least = s->noise[j];
+                lost |= (variance[i] > s->reach[j] * s->reach[j]) & g->missing[j * MOST + v];
+            }
+        forgotten &= variance[i] <= 1e-6 * (least * least);
+    }
+    forgotten &= ~some;
+    for (whole i = 0; i < size; i++)
+        for (whole k = 0; k <= i; k++) {
+            const whole from = i < r ? recorded + i : s->measured[i - r], to = k < r ? recorded + k : s->measured[k - r];
+            const double *entry = s->map + to * columns + recorded;
+            const vec *moved = g->moved + from * size;
+            vec sum = {0};
+            for (whole l = 0; l < g->counts[to]; l++) sum += moved[g->columns[to * r + l]] * entry[g->columns[to * r + l]];
+            for (whole j = 0; j < q; j++) sum += moved[r + j] * g->by[to * q + j];
+            SPREAD(i, k) = SPREAD(k, i) = either(lost, SPREAD(i, k), either(forgotten, (vec){0}, sum));
+        }
+    return 1;
+}
+
+/* The fallback into the next estimates; covariance and ages move on. */
+static void follow(const formulas *f, const vec *reg, const relift_job *s, const struct gaps *g, vec *next, whole n, whole columns, whole w)
+{
+    const whole q = s->q, recorded = s->recorded;
+    for (whole v = 0; v < w; v++) {
+        vec *start = g->gap + 3 * q * MOST + v, variance[recorded];
+        const mask waits = *start > OLDEST;
+        const vec age = *start * *start, begun = age / (1.0 + age);
+        const int uncertain = spread_on(f, reg, s, g, variance, columns, v);
         for (whole i = 0; i < recorded; i++) {
             const whole at = i * MOST + v;
-            int hidden = 1;
-            for (whole j = 0; j < q; j++) hidden &= s->measured[j] != i;
-            next[at] += begun * (next[(n - 4 * recorded) * MOST + at] - next[at]);
-            next[at] += counted(s, gap, at, 0) * (next[(n - 3 * recorded) * MOST + at] - next[at]);
+            const double least = s->half[i] * s->half[i];
+            double hidden = 1.0;
+            for (whole j = 0; j < q; j++) hidden *= s->measured[j] != i;
+            const vec weight = uncertain ? hidden * variance[i] / (variance[i] + least) : (vec){0};
+            next[at] += begun * (next[(n - 2 * recorded) * MOST + at] - next[at]);
             next[at] = clipped(next[at], (vec){0} + s->limits[i], (vec){0} + s->limits[recorded + i]);
-            const vec fallback = next[(n - 2 * recorded) * MOST + at] + next[(n - recorded) * MOST + at];
-            const vec reach = s->reach[i] * further, apart = next[at] - fallback;
-            if (hidden) next[at] -= counted(s, gap, at, 1) * apart;
-            else next[at] = either(some, fallback + clipped(apart, -reach, reach), next[at]);
+            const vec fallback = next[(n - recorded) * MOST + at];
+            next[at] += either(waits, (vec){0} + 1.0, weight) * (fallback - next[at]);
+            for (whole j = 0; j < q; j++)
+                if (s->measured[j] == i) next[at] = fallback + clipped(next[at] - fallback, (vec){0} - s->reach[j], (vec){0} + s->reach[j]);
+            next[(n - 2 * recorded) * MOST + at] = uncertain ? root(variance[i]) : (vec){0};
         }
+        for (whole j = 0; j < q; j++) g->gap[(q + j) * MOST + v] += either(g->missing[j * MOST + v], (vec){0}, (vec){0} + 1.0);
+        *start *= either(waits, (vec){0} + 1.0, (vec){0} + s->recovery[0]);
     }
 }
 
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, gaps = recorded ? s->kinds * recorded + 3 * q + 2 + q * s->filters : 0;
-    vec *gap = vectors(gaps), *missing = vectors(q), *ramp = vectors(s->filters);
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, size = s->filters + q, ages = recorded ? 3 * q + 1 : 0, known = recorded ? recorded + s->filters : 0;
+    struct gaps g = {vectors(ages), vectors(recorded ? size * size : 0), room(known * q * (whole)sizeof(vec)), room(known * size * (whole)sizeof(vec)), room(known * s->filters * (whole)sizeof(whole)), room(known * (whole)sizeof(whole)), (mask *)vectors(q)};
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;
     const whole groups = (rows + 3) / 4;
     double *map = room(4 * groups * columns * (whole)sizeof(double));
     const vec **column = room(groups * columns * (whole)sizeof(vec *));
     whole *counts = room(groups * (whole)sizeof(whole));
-    int failed = !counts || !gap || !missing || !ramp || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
+    int failed = !counts || !g.gap || !g.spread || !g.by || !g.moved || !g.columns || !g.counts || !g.missing || !reg || !c || !y || !next || !older || !map || !column || (s->own && !each);
+    for (whole i = 0; i < known && !failed; i++)
+        for (whole l = 0; l < s->filters; l++)
+            if (s->map[i * columns + recorded + l] != 0.0) g.columns[i * s->filters + g.counts[i]++] = l;
     for (whole first = 0; first < batch && !failed; first += WIDE * MOST) {
         const whole lanes = batch - first < WIDE * MOST ? batch - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
         settle(f, reg, first, batch, lanes);
         if (s->own)
             for (whole i = 0; i < rows * columns; i++) gather(each + i * MOST, s->map + first * rows * columns + i, rows * columns, lanes);
-        for (whole i = 0; i < gaps; i++) gather(gap + i * MOST, s->gap + i * batch + first, 1, lanes);
+        for (whole i = 0; i < ages; i++) gather(g.gap + i * MOST, s->gap + i * batch + first, 1, lanes);
+        for (whole i = 0; ages && i < size * size; i++)
+            for (whole b = 0; b < lanes; b++) LANES(g.spread + b / WIDE * size * size + i)[b % WIDE] = s->gap[(ages + i) * batch + first + b];
         double *state = s->column + first, *past = s->past ? s->past + first * ne : NULL;
         for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
         for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
@@ -444,19 +473,19 @@ int kros_relift(const formulas *f, const relift_job *s)
                     y[j * MOST + v] = either(seen - seen == 0.0, seen, x[v]);
                 }
             }
-            if (recorded) fill(s, gap, reg, y, (mask *)missing, n, w);
+            if (recorded) fill(s, &g, reg, y, n, w);
             for (whole j = 0; j < q && recorded; j++) {
-                for (whole v = 0; v < w; v++) next[v] = either(((mask *)missing)[j * MOST + v], (vec){0} + NAN, y[j * MOST + v]);
+                for (whole v = 0; v < w; v++) next[v] = either(g.missing[j * MOST + v], (vec){0} + NAN, y[j * MOST + v]);
                 scatter(s->y + (k * q + j) * batch + first, next, 1, lanes);
             }
             for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (k * m + j) * batch + first, 1, lanes);
             for (whole e = 0; e < ne && s->fresh && k == 0; e++) memcpy(reg + (n + e) * MOST, reg + f->present[e] * MOST, MOST * sizeof(vec));
             evaluate(f, reg, lanes);
-            if (recorded) restart(s, f, gap, reg, next, (const mask *)missing, w);
+            if (recorded) restart(s, f, &g, reg, next, w);
             if (s->own) product_each(each, columns, column, next, rows, w);
             else product(map, counts, column, next, rows, w);
             shifted(f, reg, older);
-            if (recorded) follow(f, reg, s, gap, next, (const mask *)missing, ramp, n, columns, w);
+            if (recorded) follow(f, reg, s, &g, next, n, columns, w);
             if (!within(s, rows, next, lanes)) {
                 s->left[0] = 1;
                 break;
@@ -468,9 +497,11 @@ int kros_relift(const formulas *f, const relift_job *s)
         for (whole i = 0; i < n; i++) scatter(state + i * batch, reg + i * MOST, 1, lanes);
         for (whole i = 0; i < order; i++) scatter(state + (f->n_lifted + i) * batch, c + i * MOST, 1, lanes);
         for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
-        for (whole i = 0; i < gaps; i++) scatter(s->gap + i * batch + first, gap + i * MOST, 1, lanes);
+        for (whole i = 0; i < ages; i++) scatter(s->gap + i * batch + first, g.gap + i * MOST, 1, lanes);
+        for (whole i = 0; ages && i < size * size; i++)
+            for (whole b = 0; b < lanes; b++) s->gap[(ages + i) * batch + first + b] = LANES(g.spread + b / WIDE * size * size + i)[b % WIDE];
     }
-    free(gap), free(missing), free(ramp), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);
+    free(g.gap), free(g.spread), free(g.by), free(g.moved), free(g.columns), free(g.counts), free(g.missing), free(reg), free(c), free(y), free(next), free(older), free(each), free(map), free(column), free(counts);
     return failed;
 }
 

@@ -131,12 +131,12 @@ class ObserverData:
         require_measured(self.sensor, self.outputs)
         if self.bank is not None:
             bank, recorded = self.bank, (len(self.recorded),)
-            ages = (2 * min(2, q), *recorded)  # of losses of all measurements and, of several, of some
-            shapes = bank.start.shape, bank.half.shape, bank.recovery.shape, bank.reach.shape
-            self._require("start, half, recovery and reach", shapes, ((n, rows + columns), ages, (2,), recorded))
-            of_gaps = bank.gate.shape, bank.opening.shape, bank.pull.shape
-            self._require("gate, opening and pull", of_gaps, ((q,), (q,), (*recorded, q)))
-            if not 0 <= bank.filters <= (most := n - 5 * recorded[0]) or K.D.any() or K.n_states:
+            shapes = tuple(getattr(bank, key).shape for key in ("start", "half", "recovery", "doubt"))
+            wanted = (n, rows + columns), recorded, (1,), (bank.filters,) * 2
+            self._require("start, half, recovery and doubt", shapes, wanted)
+            of_measurements = tuple(getattr(bank, key).shape for key in ("reach", "noise", "rest", "gate", "opening"))
+            self._require("reach, noise, rest, gate and opening", of_measurements, ((q,),) * 5)
+            if not 0 <= bank.filters <= (most := n - 3 * recorded[0]) or K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, and of its states at most {most} filters "
                     f"of measurements; found a correction of order {K.n_states} and {bank.filters} filters."

@@ -67,7 +67,7 @@ class Steps:
             self.gaps.begin_filters(theta, inputs, missing)
         following = np.concatenate([theta, self.x_c, inputs, y], axis=-1) @ self._map.T
         if self.gaps is not None:
-            self.gaps.follow(following[:, :n], missing, self._into_filters(window, u) if missing.any() else None)
+            self.gaps.follow(following[:, :n], missing, self._slopes(window, u) if missing.any() else None)
         within = ((following >= self._low) & (following <= self._high)).all(axis=-1)
         going = ~self.waiting if moving is None else moving & ~self.waiting
         self.waiting |= going & ~within  # a step that would leave the bounds is not taken
@@ -106,12 +106,13 @@ class Steps:
         if self.gaps is not None:
             self.gaps.take(job["gap"])
 
-    def _into_filters(self, window: Array, u: Array) -> Array:
-        """Return the slopes of the next filters by the measurements, shape (batch, filters, q)."""
+    def _slopes(self, window: Array, u: Array) -> Array:
+        """Return the slopes of the next recorded states and filters by measurements, (batch or 1, n + filters, q)."""
         assert self.gaps is not None
         observer, names = self.observer, self.lifting.states
         by = tuple(names[i] for i in self._measured)
-        A, B = observer.A[self.gaps.filters], observer.B[self.gaps.filters, u.shape[1] :]
+        end = self.gaps.filters.stop
+        A, B = observer.A[:end], observer.B[:end, u.shape[1] :]
         lifted = A[:, len(names) :] @ self.lifting.slopes(window, self.values, by)
         return A[:, self._measured] + lifted + B @ self.lifting.slopes(window, self.values, by, u)
 

@@ -33,9 +33,8 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
         "monitor": {"size": y},
         "bank": {
             "start": x[: lifting.n_states, None] / np.concatenate([x, u]),
-            "reach": x[: len(observer.recorded)],
-            "gate": y,
-            "pull": x[: len(observer.recorded), None] / y,
+            "half": x[: len(observer.recorded)],
+            **dict.fromkeys(("reach", "noise", "rest", "gate"), y),
         },
         "guard": dict.fromkeys(("lower", "upper"), x[: lifting.n_states]),
         "runtime": dict.fromkeys(observer.runtime.by_state(), x[: lifting.n_states]),
@@ -62,7 +61,7 @@ def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, 
     x, u = (old.sizes_of(names) / new.sizes_of(names) for names in (old.names, inputs))
     if observer.bank is not None:  # its last states have the units of the recorded ones
         n, recorded = old.n_states, len(observer.recorded)
-        x[n - 4 * recorded : n] = np.tile(x[:recorded], 4)
+        x[n - 2 * recorded : n] = np.tile(x[:recorded], 2)
     return x, u
 
 

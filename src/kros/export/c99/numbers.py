@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core import Array, ConfigError, Record, frozen
+from ...core import AGREED, Array, ConfigError, Record, frozen
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer, recorded_channel, recorded_factors
@@ -107,7 +107,7 @@ class Source:
             "single": self.precision.type == "float",
             "monitor": o.monitor,
             "bank": o.bank,
-            "bridges": self.bridges(),
+            "bridge": self.bridge(),
             "shift": self.shift,
             "shift_others": [i for i in np.flatnonzero(moving).tolist() if i != o.measured[0]],
             "load": self.load_torque(),
@@ -136,8 +136,9 @@ class Source:
             "guard": np.clip([low, high], -self.precision.largest, self.precision.largest),
             "bounds": self.bounds(),
             "gate": () if o.bank is None else np.minimum(o.bank.gate, self.precision.largest),
+            "rest": () if o.bank is None else np.minimum(o.bank.rest, self.precision.largest),
             "OLDEST": OLDEST,
-            "ages": 0 if o.bank is None else o.bank.half.size,
+            "quiet": () if o.bank is None else AGREED * o.bank.least(o.measured) ** 2,
             "rule": {"beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},
             "longest": Screen.of(o).longest,
             "LONGEST": LONGEST,
@@ -171,20 +172,34 @@ class Source:
         """Return the literals of factors in double precision; none where all are one."""
         return [] if all(factor == 1 for factor in factors) else row(np.array(factors))
 
-    def bridges(self) -> list[Record]:
-        """Return slopes of functions by every measurement, and by what they and ramps go into ramps of the filters."""
-        o, found = self.observer, list[Record]()
+    def bridge(self) -> Record | None:
+        """Return how recorded states and filters follow from filters, and by what slopes from every measurement."""
+        o = self.observer
         if o.bank is None:
-            return found
-        n, m = o.lifting.n_states, len(o.inputs)
-        filters = slice(len(o.recorded), len(o.recorded) + o.bank.filters)
-        A, functions = o.A[filters], np.hstack([o.A[:, n:], o.B[:, m:]])[filters]
+            return None
+        n, m, end = o.lifting.n_states, len(o.inputs), len(o.recorded) + o.bank.filters
+        A, functions, slopes = o.A[:end], np.hstack([o.A[:, n:], o.B[:, m:]])[:end], list[Record]()
         for i, output in zip(o.measured, o.outputs, strict=True):
             trees = [f.derivative(output) for f in (*o.lifting.formulas, *o.lifting.input_formulas)]
             moving = [j for j, tree in enumerate(trees) if tree != 0]
-            rows = np.column_stack([A[:, i], functions[:, moving], A[:, filters]])
-            found.append({"slopes": [f"({self.code(trees[j])})" for j in moving], "rows": self.sums(rows)})
-        return found
+            rows = np.column_stack([A[:, i], functions[:, moving]])
+            values = [f"({self.code(trees[j])})" for j in moving]
+            slopes.append(
+                {
+                    "functions": values,
+                    "rows": [[(j, DOUBLE.literal(v)) for j, v in enumerate(row) if v] for row in rows.tolist()],
+                }
+            )
+        filters = A[:, len(o.recorded) : end]
+        row, column = np.nonzero(filters)
+        q, size = len(o.measured), len(o.measured) + o.bank.filters
+        return {
+            "operations": 3 * size * (len(row) + q * end) + 2 * q * size**2,
+            "entries": filters[row, column],
+            "columns": column.tolist(),
+            "rows": np.searchsorted(row, range(end + 1)).tolist(),
+            "slopes": slopes,
+        }
 
     def tracked(self, loop: PhaseLockedLoop) -> Record:
         """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""

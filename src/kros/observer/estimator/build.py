@@ -17,13 +17,11 @@ from ..filter_bank import FilterBank
 from ..observer import Observer
 from ..runtime import Runtime
 from .channels import FAMILIES, channels_of
-from .gaps import distances, with_gaps
+from .gaps import with_fallback, with_gate
 from .reduction import Filters, reduced
 from .regression import Readout, is_less
 from .rows import Design, Group, Recordings
 from .settings import EstimatorSettings
-
-READOUTS = ("after_start", "after_loss")  # beside that of all other time
 
 
 @frozen
@@ -87,36 +85,23 @@ def identify_estimator(
     hidden = [i for i in range(n) if i not in measured] or list(measured)
     require_known(settings.unbounded, [lifting.states[i] for i in measured], inputs)
     readout, blind, family = best_family(lifting, measured, inputs, recordings, settings, hidden, poles)
-    held = [measured[i] for i in blind.design.channels.held]
 
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
-        return assembled(name, lifting, inputs, readout.design, (filters, fallback), sample_period_s, parameters or {})
+        systems = filters, fallback
+        observer = assembled(name, lifting, inputs, readout.design, systems, sample_period_s, parameters or {})
+        return replace(observer, runtime=bounded(observer, recordings, settings))
 
     def fallback_of(one: Readout, order: int | None) -> Filters:
         return reduced(replace(one, coefficients=one.coefficients[:, :n]), order)
 
     filters, fallback = reduced(readout, settings.order), fallback_of(blind, settings.order)
     observer, orders = observer_of(filters, fallback), (len(filters.A), len(fallback.A))
-    F, pull, apart, (gate, opening) = distances(observer, recordings, settings, held)
-    near = [i for i in measured if i not in held]
-
-    def complete(one: Observer) -> Observer:
-        assert one.bank is not None
-        A, reach, offset = one.A.copy(), one.bank.reach.copy(), slice(one.lifting.n_states - n, one.lifting.n_states)
-        reach[near] = settings.reach * apart[near]
-        A[offset, offset] = F
-        bank = replace(one.bank, reach=reach, pull=pull)
-        return replace(one, A=A, runtime=bounded(one, recordings, settings), bank=bank)
 
     def trial(group: Group) -> Observer:
-        return complete(
-            observer_of(reduced(readout.without(group), orders[0]), fallback_of(blind.without(group), orders[1]))
-        )
+        return observer_of(reduced(readout.without(group), orders[0]), fallback_of(blind.without(group), orders[1]))
 
     trials = [(trial(group), unseen) for group, unseen in readout.left_out_groups()]
-    observer = complete(observer)
-    assert observer.bank is not None
-    bank = replace(with_gaps(observer.bank, trials, F, settings), gate=gate, opening=opening)
+    bank = with_fallback(with_gate(observer, recordings, settings), trials, settings)
     observer, states = replace(observer, bank=bank), lifting.states
 
     def by_state(values: Array) -> dict[str, float]:
@@ -214,16 +199,16 @@ def assembled(
     n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
     bare = channels.lifting
     own = [*(f"filter_{i + 1}" for i in range(r)), *(f"input_filter_{i + 1}" for i in range(s))]
-    own += [f"{state}_{what}" for what in (*READOUTS, "from_inputs", "offset_from_inputs") for state in bare.states]
+    own += [f"{state}_{what}" for what in ("after_start", "from_inputs") for state in bare.states]
     widened = replace(bare, states=(*bare.states, *own))
     total, columns = widened.n_states, widened.n_lifted + len(inputs) + len(bare.input_functions)
     places = [c if c < n else c + total - n for c in channels.columns]
     blind = [c + total - n for c in without.columns]
-    z, w, f, u = np.split(np.arange(n, total - n), np.cumsum([r, s, len(READOUTS) * n]))
+    z, w, f, u = np.split(np.arange(n, total), np.cumsum([r, s, n]))
     x, at = np.arange(n), list(channels.measured)
     model, start = np.zeros((total, columns)), np.zeros((total, columns))
     after = filters.C @ filters.S + filters.D  # as if nothing had moved before: no step at the start
-    first = after[n : 2 * n]
+    first = after[n:].copy()
     first[at] = np.eye(len(at), len(channels))
     for rows, states, inputs_of, *system in (
         (x, z, places, filters.C[:n], filters.D[:n], first),
@@ -237,17 +222,16 @@ def assembled(
     model[u[held], held] = 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
-    low, high = (end[:n] for end in design.recordings.ranges)
-    gaps = FilterBank(
-        r,
-        start,
-        np.ones((2 * min(2, len(at)), n)),
-        np.exp([-5 / bank.delays, -5 / fade]),
+    low, high = (end[at] for end in design.recordings.ranges)
+    unknown = (
+        np.zeros((r, r)),
+        np.ones(n),
         high - low,
-        np.full(len(at), np.inf),
+        np.ones(len(at)),
+        *np.full((2, len(at)), np.inf),
         np.zeros(len(at)),
-        np.zeros((n, len(at))),
     )
+    gaps = FilterBank(r, start, np.exp([-5 / fade]), *unknown)
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(

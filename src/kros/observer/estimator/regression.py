@@ -19,7 +19,7 @@ from ...core import EPS, ROUNDING, AnyArray, Array, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
 from .rows import Design, Group, Recordings, Sample, Triangles
 
-Candidate = tuple[float, float, float, float]  # penalty, and weights of starts elsewhere, restarts and bridges
+Candidate = tuple[float, float, float]  # penalty, and weights of starts elsewhere and of restarts
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
 
 
@@ -33,20 +33,19 @@ class Whitening:
     trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
     disturbed: Array  # (r, r), the same after a start in the middle of an episode
     elsewhere: Array  # (r, r), the same of a start at another place
-    bridges: Array  # (r, r), the same of straight lines over lost measurements
 
     @classmethod
     def of(cls, design: Design, sample: Sample) -> Whitening:
         """Find the directions from thinned rows, and what rows with errors of weights add."""
         bank, settings = design.bank, design.settings
         size = bank.sizes(np.linalg.norm(sample.rows, axis=0))
-        disturbed, elsewhere, bridges = sample.restarts / size, sample.elsewhere / size, sample.bridges / size
+        disturbed, elsewhere = sample.restarts / size, sample.elsewhere / size
         trust = np.vstack([np.diag(settings.nonlinear_trust * (bank.channel >= bank.linear)), sample.errors / size])
         starts = np.sqrt(settings.settled_share) * disturbed, np.sqrt(settings.start_share) * elsewhere
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([sample.rows / size, trust, *starts])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count]
-        moments = (rows.T @ rows for rows in (each @ directions for each in (trust, disturbed, elsewhere, bridges)))
+        moments = (rows.T @ rows for rows in (each @ directions for each in (trust, disturbed, elsewhere)))
         return cls(sample.rows, directions / size[:, None], sigma[:count] ** -2.0, *moments)
 
 
@@ -103,8 +102,8 @@ class Moments:
         gram = np.tensordot(weights, self.gram, 1) + whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 16 * len(gram) * EPS
-        for penalty, start, restart, bridge in candidates:
-            A = gram + start * whitening.elsewhere + restart * whitening.disturbed + bridge * whitening.bridges
+        for penalty, start, restart in candidates:
+            A = gram + start * whitening.elsewhere + restart * whitening.disturbed
             A.flat[:: len(A) + 1] += penalty * whitening.penalty
             q = 1 / np.sqrt(np.diag(A))
             A *= q[:, None] * q
@@ -112,14 +111,14 @@ class Moments:
             yield q[:, None] * cho_solve(cho_factor(A, overwrite_a=True, check_finite=False), q[:, None] * cross)
 
     def best(self, errors: Array, among: Flags | slice = slice(None)) -> Whole:
-        """Return the best candidates of every state for each set of weights, which come in turn, shape (3 n,).
+        """Return the best candidates of every state for each set of weights, which come in turn, shape (2 n,).
 
         They are best by logarithms of errors (groups, candidates, n) on what is left out, among all groups or some.
         """
         # A state at zero throughout a group would ask for no estimate of it at all.
         counted = (self.power[among] > 0)[:, None]
         mean = np.log(errors[among]).mean(axis=0, where=counted | ~counted.any(axis=0))
-        return np.concatenate([3 * mean[i::3].argmin(axis=0) + i for i in range(3)])
+        return np.concatenate([2 * mean[i::2].argmin(axis=0) + i for i in range(2)])
 
     def known(self, group: Group) -> Flags:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
@@ -141,10 +140,10 @@ class Readout:
 
     design: Design
     sample: Array  # triangle of thinned rows of the bank
-    coefficients: Array  # (p, 3 n): of all states, and of these for the time after a start and after a loss
+    coefficients: Array  # (p, 2 n): of all states, and of these for the time after a start
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
-    others: dict[Group, Array]  # coefficients (p, 3 n) that do not know a group, over the sizes
+    others: dict[Group, Array]  # coefficients (p, 2 n) that do not know a group, over the sizes
 
     @classmethod
     def of(cls, designs: Sequence[Design]) -> list[Readout]:
@@ -160,13 +159,12 @@ class Readout:
         whitening = moments.whitening
         settings = design.settings
         weights = condition_weights(moments, settings.restart_share)
-        start = settings.start_share, settings.restart_share
-        weights_of = (0.0, settings.settled_share, 0.0), (*start, 0.0), (*start, settings.gap_share)
+        weights_of = (0.0, settings.settled_share), (settings.start_share, settings.restart_share)
         candidates = [(penalty, *each) for penalty, each in product(settings.penalties, weights_of)]
         others = moments.without(weights, candidates)
         left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         errors, folds, n = np.array(left_out), moments.of_groups("fold"), moments.power.shape[1]
-        states, best = np.tile(np.arange(n), 3), moments.best(errors)
+        states, best = np.tile(np.arange(n), 2), moments.best(errors)
         coefficients = np.array(list(moments.solved(weights, candidates)))[best, :, states].T
         # What is left out took no part in the choice that it is judged with.
         nested = [moments.best(errors, folds != fold if np.ptp(folds) else slice(None)) for fold in folds]
@@ -174,7 +172,7 @@ class Readout:
         return cls(
             design,
             whitening.sample,
-            whitening.directions @ coefficients * np.tile(design.recordings.size, 3),
+            whitening.directions @ coefficients * np.tile(design.recordings.size, 2),
             np.array([errors[i, choice[:n], states[:n]] for i, choice in enumerate(nested)]),
             moments.errors(coefficients[:, :n]),
             {g: whitening.directions @ np.array(each)[choice, :, states].T for (g, each), choice in unaware},
@@ -198,7 +196,7 @@ class Readout:
 
     def without(self, group: Group) -> Readout:
         """Return the readout that does not know a group."""
-        return replace(self, coefficients=self.others[group] * np.tile(self.design.recordings.size, 3))
+        return replace(self, coefficients=self.others[group] * np.tile(self.design.recordings.size, 2))
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
@@ -225,6 +223,6 @@ def condition_weights(moments: Moments, restart: float) -> Array:
     """Return weights of the groups: by rows within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
     alike = conditions[:, None] == conditions
-    (first,) = moments.solved(moments.rows, [(ROUNDING, 0.0, restart, 0.0)])
+    (first,) = moments.solved(moments.rows, [(ROUNDING, 0.0, restart)])
     errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
     return moments.rows / (alike @ moments.rows) * alike.sum(axis=1) ** 2 / (alike @ errors)

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ...core import Array, Flags, Whole, frozen
+from ...core import Array, Whole, frozen
 from ...core.linalg import qr_triangle
 from ...data import EpisodeBatch, EpisodeKey
 from .bank import Bank
@@ -107,18 +107,12 @@ class Recordings:
         return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
 
 
-def bridged(y: Array, lost: Flags) -> Array:
-    """Return measurements (n_samples, q) with straight lines over samples that are lost, (n_samples,)."""
-    there, every = np.flatnonzero(~lost), np.arange(len(y))
-    return np.stack([np.interp(every, there, column[there]) for column in y.T], axis=1)
-
-
 def spread(items: Sequence[T], count: int) -> list[T]:
     """Return so many items, evenly spaced from the first to the last."""
     return [items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)]
 
 
-SAMPLED = ("rows", "restarts", "elsewhere", "bridges", "errors")
+SAMPLED = ("rows", "restarts", "elsewhere", "errors")
 
 
 @frozen
@@ -128,7 +122,6 @@ class Sample:
     rows: Array
     restarts: Array  # what a start in the middle of an episode changes
     elsewhere: Array  # what a first sample at another place changes
-    bridges: Array  # what straight lines over lost measurements change
     errors: Array  # what errors of measurements change, with their weights
 
     def of(self, columns: Whole) -> Sample:
@@ -223,10 +216,6 @@ class Design:
             triangles.add("rows", root * rows)
             triangles.add("restarts", root * bank.restarted(signals, first, begin, begin + at))
             triangles.add("elsewhere", root * elsewhere)
-            if not self.channels.inputs_only:
-                lost = np.random.default_rng(settings.seed).random(len(y)) < 0.5
-                changes = self.seen(self.signals(batch, bridged(y, lost)), at) - rows
-                triangles.add("bridges", root * changes)
             if bias is not None and bias.any():  # of either sign: it adds its own moment to the errors
                 triangles.add("errors", root * (self.seen(self.signals(batch, y + bias), at) - rows))
             weight += weights.sum()

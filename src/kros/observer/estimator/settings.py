@@ -75,12 +75,6 @@ class EstimatorSettings(Settings):
         description="time after a start until the second readout counts below one percent, in the slowest lags",
     )
     settled_share: float = Field(3e-3, gt=0, description="weight of the errors of `restart_share` for all other time")
-    gap_share: float = Field(
-        0.01,
-        ge=0,
-        description="weight of the errors that straight lines over lost measurements make, half of them, for the time "
-        "after a loss",
-    )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"
     )
@@ -91,10 +85,10 @@ class EstimatorSettings(Settings):
         description="ratio of the weights of hidden and measured states in the reduction",
     )
     halves: tuple[float, ...] = Field(
-        (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
+        (0.01, 0.03, 0.1, 0.3, 1.0, 3.0),
         min_length=1,
-        description="ages of a gap at which the readout after losses and the fallback count one half, in longest "
-        "delays; training chooses",
+        description="errors, by the Kalman filter over losses, at which the fallback counts one half, in RMS errors of "
+        "the fallback; training chooses",
     )
     room: float = Field(
         0.25,
@@ -105,17 +99,11 @@ class EstimatorSettings(Settings):
         {},
         description="least and largest value that a state can have, as the current of a drive; estimates stay inside",
     )
-    reach: float = Field(
-        2.0,
-        ge=0,
-        description="distance that a missing measurement may have from the fallback, in RMS distances of recorded ones "
-        "from what the inputs say",
-    )
     gate: float = Field(
         5.0,
         gt=0,
         description="distance of a measurement from its estimate, in largest ones of training, from which it counts as "
-        "missing; more after a start and in a gap",
+        "missing; more after a start and where it is less certain",
     )
     gap_samples: int = Field(
         240_000, ge=100, description="samples on which losses are simulated in training, over all episodes"

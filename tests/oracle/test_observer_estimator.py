@@ -508,7 +508,7 @@ def test_filters_after_losses_are_what_all_that_has_arrived_says(measured):
 
 
 def test_a_start_in_motion_is_known_after_few_samples():
-    """An undamped oscillator by its position: where the filters start does not matter after as many samples as it has states, if doubted."""
+    """An oscillator by its position: innovations correct filters that are doubted, where the first step is beyond `rest`."""
     lifting, rng = Lifting(("position", "velocity")), np.random.default_rng(3)
     recordings, _ = from_rest(list(rng.uniform(-2, 2, 6)), 1)
     unseen = from_rest(list(rng.uniform(-2, 2, 4)), 2)[1]

@@ -376,7 +376,7 @@ static int spread_on(const formulas *f, const vec *reg, const relift_job *s, con
                 least = s->noise[j];
                 lost |= (variance[i] > s->reach[j] * s->reach[j]) & g->missing[j * MOST + v];
             }
-        forgotten &= variance[i] <= 1e-6 * (least * least);
+        forgotten &= variance[i] <= 1e-6 * (least * least); /* AGREED of kros.core */
     }
     forgotten &= ~some;
     for (whole i = 0; i < size; i++)

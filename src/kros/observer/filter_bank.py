@@ -79,7 +79,7 @@ class FilterBank:
         """Samples that a start takes: after as many refused in a row a measurement is believed."""
         return round(-5 / np.log(self.recovery[0]))
 
-    def least(self, measured: Sequence[int]) -> Array:
+    def error_sizes(self, measured: Sequence[int]) -> Array:
         """Return the errors of recorded states to which those that losses make are compared, (n,)."""
         errors = self.half.copy()
         errors[list(measured)] = self.noise
@@ -213,7 +213,7 @@ class Gaps:
         spread = moved[:, rows] @ T[:, rows].swapaxes(1, 2)
         spread = np.tril(spread) + np.tril(spread, -1).swapaxes(1, 2)
         lost = ((variance[:, self.measured] > bank.reach**2) & missing).any(axis=1)
-        forgotten = ~missing.any(axis=1) & (variance <= AGREED * bank.least(self.measured) ** 2).all(axis=1)
+        forgotten = ~missing.any(axis=1) & (variance <= AGREED * bank.error_sizes(self.measured) ** 2).all(axis=1)
         spread[forgotten] = 0.0
         self.spread[~lost] = spread[~lost]
         return variance

@@ -121,6 +121,7 @@ def forward(observer: ObserverData, values: Parameters, count: Index, x: Array, 
     """Predict states (batch, n) over the first ``count`` inputs of u (d, batch, m), without correction."""
     steps, missing = Steps(observer, len(x), values), np.full((len(x), len(observer.measured)), np.nan)
     steps.x[...], steps.past[...], steps.fresh[:] = x, earlier, False
+    steps.gaps = None  # of filter banks, what is predicted stands for measurements, as in generated C
     for j, inputs in enumerate(u):
         steps.step(missing, inputs, j < count)
     return steps.x

@@ -138,7 +138,7 @@ class Source:
             "gate": () if o.bank is None else np.minimum(o.bank.gate, self.precision.largest),
             "rest": () if o.bank is None else np.minimum(o.bank.rest, self.precision.largest),
             "OLDEST": OLDEST,
-            "quiet": () if o.bank is None else AGREED * o.bank.least(o.measured) ** 2,
+            "quiet": () if o.bank is None else AGREED * o.bank.error_sizes(o.measured) ** 2,
             "rule": {"beyond": BEYOND, "recovery": RECOVERY, "largest": LARGEST, "quiet": QUIET},
             "longest": Screen.of(o).longest,
             "LONGEST": LONGEST,

@@ -17,7 +17,7 @@ from ..filter_bank import FilterBank
 from ..observer import Observer
 from ..runtime import Runtime
 from .channels import FAMILIES, channels_of
-from .gaps import with_fallback, with_gate
+from .gaps import with_errors, with_fallback
 from .reduction import Filters, reduced
 from .regression import Readout, is_less
 from .rows import Design, Group, Recordings
@@ -101,7 +101,7 @@ def identify_estimator(
         return observer_of(reduced(readout.without(group), orders[0]), fallback_of(blind.without(group), orders[1]))
 
     trials = [(trial(group), unseen) for group, unseen in readout.left_out_groups()]
-    bank = with_fallback(with_gate(observer, recordings, settings), trials, settings)
+    bank = with_fallback(with_errors(observer, recordings, settings), trials, settings)
     observer, states = replace(observer, bank=bank), lifting.states
 
     def by_state(values: Array) -> dict[str, float]:
@@ -223,15 +223,18 @@ def assembled(
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[at] for end in design.recordings.ranges)
-    unknown = (
-        np.zeros((r, r)),
-        np.ones(n),
-        high - low,
-        np.ones(len(at)),
-        *np.full((2, len(at)), np.inf),
-        np.zeros(len(at)),
+    gaps = FilterBank(  # training says the rest
+        filters=r,
+        start=start,
+        recovery=np.exp([-5 / fade]),
+        doubt=np.zeros((r, r)),
+        half=np.ones(n),
+        reach=high - low,
+        noise=np.ones(len(at)),
+        rest=np.full(len(at), np.inf),
+        gate=np.full(len(at), np.inf),
+        opening=np.zeros(len(at)),
     )
-    gaps = FilterBank(r, start, np.exp([-5 / fade]), *unknown)
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(

@@ -47,7 +47,7 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
     return missing
 
 
-def with_gate(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
+def with_errors(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
     """Return the observer's bank with errors of one step, gates, doubts at a start, and the fallback's RMS errors.
 
     Gates, b and w, are several times the largest distances of measurements from their estimates in training, of starts

@@ -61,8 +61,8 @@ class EstimatorSettings(Settings):
     start_share: float = Field(
         0.2,
         gt=0,
-        description="weight of the errors that the first sample makes at another place, for the time after a start or "
-        "a loss: rows with target zero, since machines start elsewhere than in recordings",
+        description="weight of the errors that the first sample makes at another place, for the time after a start: "
+        "rows with target zero, since machines start elsewhere than in recordings",
     )
     restart_share: float = Field(
         0.03,

@@ -220,7 +220,7 @@ def test_left_out_errors_are_those_of_penalties_that_other_units_chose():
     settings, weights = made.settings, condition_weights(moments, made.settings.restart_share)
     candidates = [(penalty, 0.0, settings.settled_share) for penalty in settings.penalties]
     others, folds = moments.without(weights, candidates), moments.of_groups("fold")
-    errors = np.array([[moments.errors(c)[i] for c in others[g]] for i, g in enumerate(moments.groups)])
+    errors = np.array([moments.errors(others[g])[i] for i, g in enumerate(moments.groups)])
     differing = 0
     for i, fold in enumerate(folds):
         choice = np.log(errors[folds != fold]).mean(axis=0).argmin(axis=0)

@@ -9,7 +9,7 @@ coefficients that know neither the unit nor its episodes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from ...core import EPS, ROUNDING, AnyArray, Array, Flags, Whole, frozen
 from ...core.linalg import qr_triangle
-from .rows import Design, Group, Recordings, Sample, Triangles
+from .rows import Design, Group, Recordings, Sample
 
 Candidate = tuple[float, float, float]  # penalty, and weights of starts elsewhere and of restarts
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
@@ -63,52 +63,55 @@ class Moments:
     @classmethod
     def of(cls, designs: Sequence[Design], whitenings: Sequence[Whitening]) -> list[Moments]:
         """Sum the rows of every group, for every design: their banks are parts of that of the last."""
-        last = designs[-1]
+        last, n = designs[-1], len(designs[-1].recordings.size)
         some = last.recordings.some(last.settings.episodes, last.groups)
         places = [last.bank.places(design.bank) for design in designs]
         groups = tuple(dict.fromkeys(last.groups[key] for key in some.keys))
-        width = len(last.bank)
-        triangles = Triangles(width + len(last.recordings.size))
+        count, sizes = len(groups), [len(whitening.penalty) for whitening in whitenings]
+        total, power = np.zeros(count), np.zeros((count, n))
+        moments = [(np.zeros((count, r, r)), np.zeros((count, r, n))) for r in sizes]
         for key, rows, targets, weights in last.rows(some, last.settings.rows):
-            triangles.add(last.groups[key], np.sqrt(weights)[:, None] * np.hstack([rows, targets]))
-        sums = [triangles.of(group) for group in groups]
-        roots = [np.linalg.norm(each[:, width - 1]) for each in sums]  # of counts: the last entry of a bank is one
-        means = [each / root for each, root in zip(sums, roots, strict=True)]
-        power = np.array([(mean[:, width:] ** 2).sum(axis=0) for mean in means])
-        found = []
-        for whitening, entries in zip(whitenings, places, strict=True):
-            whites = [mean[:, entries] @ whitening.directions for mean in means]
-            gram = np.array([white.T @ white for white in whites])
-            cross = np.array([white.T @ mean[:, width:] for white, mean in zip(whites, means, strict=True)])
-            found.append(cls(whitening, groups, gram, cross, power, np.square(roots)))
-        return found
+            group, root = groups.index(last.groups[key]), np.sqrt(weights)[:, None]
+            total[group] += weights.sum()
+            power[group] += weights @ targets**2
+            for (gram, cross), whitening, entries in zip(moments, whitenings, places, strict=True):
+                white = root * (rows[:, entries] @ whitening.directions)
+                gram[group] += white.T @ white
+                cross[group] += white.T @ (root * targets)
+        for values in (power, *(value for pair in moments for value in pair)):
+            values /= total.reshape(-1, *[1] * (values.ndim - 1))
+        return [cls(w, groups, *pair, power, total) for w, pair in zip(whitenings, moments, strict=True)]
 
     def of_groups(self, what: str) -> AnyArray:
         """Return fold, condition or part of every group."""
         return np.array([getattr(group, what) for group in self.groups])
 
     def errors(self, coefficients: Array, groups: slice = slice(None)) -> Array:
-        """Return the mean squared errors of coefficients (r, n) in some groups, shape (groups, n)."""
-        quadratic = np.einsum("in,gin->gn", coefficients, self.gram[groups] @ coefficients)
-        found = self.power[groups] - 2 * np.einsum("in,gin->gn", coefficients, self.cross[groups]) + quadratic
-        return np.maximum(found, 1e-30)
+        """Return the mean squared errors of coefficients (candidates, r, n), shape (groups, candidates, n)."""
+        flat = coefficients.swapaxes(0, 1).reshape(coefficients.shape[1], -1)
+        quadratic = (flat * (self.gram[groups] @ flat)).sum(axis=1).reshape(-1, *coefficients.shape[::2])
+        mixed = np.einsum("crn,grn->gcn", coefficients, self.cross[groups])
+        return np.maximum(self.power[groups, None] - 2 * mixed + quadratic, 1e-30)
 
-    def solved(self, weights: Array, candidates: Sequence[Candidate]) -> Iterator[Array]:
-        """Yield ridge coefficients (r, n) of groups with weights, for every candidate."""
+    def solved(self, weights: Array, candidates: Sequence[Candidate]) -> Array:
+        """Return ridge coefficients of groups with weights, for every candidate, shape (candidates, r, n)."""
         from scipy.linalg import cho_factor, cho_solve
 
         weights = weights / weights.sum()
         whitening = self.whitening
         gram = np.tensordot(weights, self.gram, 1) + whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
-        rounding = 16 * len(gram) * EPS
-        for penalty, start, restart in candidates:
-            A = gram + start * whitening.elsewhere + restart * whitening.disturbed
-            A.flat[:: len(A) + 1] += penalty * whitening.penalty
-            q = 1 / np.sqrt(np.diag(A))
-            A *= q[:, None] * q
-            A.flat[:: len(A) + 1] += rounding
-            yield q[:, None] * cho_solve(cho_factor(A, overwrite_a=True, check_finite=False), q[:, None] * cross)
+        rounding = 1 + 16 * len(gram) * EPS
+        whole = {
+            tuple(each): gram + each[0] * whitening.elsewhere + each[1] * whitening.disturbed for _, *each in candidates
+        }
+        found = np.zeros((len(candidates), *cross.shape))
+        for i, (penalty, *each) in enumerate(candidates):
+            A = whole[tuple(each)].copy()
+            A.flat[:: len(A) + 1] = rounding * (np.diag(A) + penalty * whitening.penalty)
+            factor = cho_factor(A.T, lower=True, overwrite_a=True, check_finite=False)  # as LAPACK stores it: no copies
+            found[i] = cho_solve(factor, cross, check_finite=False)
+        return found
 
     def best(self, errors: Array, among: Flags | slice = slice(None)) -> Whole:
         """Return the best candidates of every state for each set of weights, which come in turn, shape (2 n,).
@@ -126,11 +129,11 @@ class Moments:
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
         return next(known for known in (folds & parts, folds, parts, folds | True) if (known & alike).any())
 
-    def without(self, weights: Array, candidates: Sequence[Candidate]) -> dict[Group, list[Array]]:
+    def without(self, weights: Array, candidates: Sequence[Candidate]) -> dict[Group, Array]:
         """Return the coefficients that do not know a group, for every group and candidate."""
         known = {group: self.known(group) for group in self.groups}
         several = {rest.tobytes(): np.where(rest, weights, 0.0) for rest in known.values()}
-        found = {key: list(self.solved(rest, candidates)) for key, rest in several.items()}
+        found = {key: self.solved(rest, candidates) for key, rest in several.items()}
         return {group: found[rest.tobytes()] for group, rest in known.items()}
 
 
@@ -162,10 +165,10 @@ class Readout:
         weights_of = (0.0, settings.settled_share), (settings.start_share, settings.restart_share)
         candidates = [(penalty, *each) for penalty, each in product(settings.penalties, weights_of)]
         others = moments.without(weights, candidates)
-        left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
-        errors, folds, n = np.array(left_out), moments.of_groups("fold"), moments.power.shape[1]
+        errors = np.concatenate([moments.errors(others[g], slice(i, i + 1)) for i, g in enumerate(moments.groups)])
+        folds, n = moments.of_groups("fold"), moments.power.shape[1]
         states, best = np.tile(np.arange(n), 2), moments.best(errors)
-        coefficients = np.array(list(moments.solved(weights, candidates)))[best, :, states].T
+        coefficients = moments.solved(weights, candidates)[best, :, states].T
         # What is left out took no part in the choice that it is judged with.
         nested = [moments.best(errors, folds != fold if np.ptp(folds) else slice(None)) for fold in folds]
         unaware = zip(others.items(), nested, strict=True)
@@ -174,8 +177,8 @@ class Readout:
             whitening.sample,
             whitening.directions @ coefficients * np.tile(design.recordings.size, 2),
             np.array([errors[i, choice[:n], states[:n]] for i, choice in enumerate(nested)]),
-            moments.errors(coefficients[:, :n]),
-            {g: whitening.directions @ np.array(each)[choice, :, states].T for (g, each), choice in unaware},
+            moments.errors(coefficients[None, :, :n])[:, 0],
+            {g: whitening.directions @ each[choice, :, states].T for (g, each), choice in unaware},
         )
 
     def left_out_groups(self) -> list[tuple[Group, Recordings]]:
@@ -223,6 +226,6 @@ def condition_weights(moments: Moments, restart: float) -> Array:
     """Return weights of the groups: by rows within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
     alike = conditions[:, None] == conditions
-    (first,) = moments.solved(moments.rows, [(ROUNDING, 0.0, restart)])
-    errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
+    first = moments.solved(moments.rows, [(ROUNDING, 0.0, restart)])
+    errors = np.exp(np.log(moments.errors(first)).mean(axis=(1, 2)))
     return moments.rows / (alike @ moments.rows) * alike.sum(axis=1) ** 2 / (alike @ errors)

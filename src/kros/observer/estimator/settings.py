@@ -109,7 +109,7 @@ class EstimatorSettings(Settings):
         240_000, ge=100, description="samples on which losses are simulated in training, over all episodes"
     )
     gap_episodes: int = Field(
-        12, ge=1, description="patterns of losses that are simulated on them, at least; more on short episodes"
+        32, ge=1, description="patterns of losses that are simulated on them, at least; more on short episodes"
     )
     seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")
 

@@ -285,6 +285,17 @@ def test_a_wrong_first_sample_is_outvoted(motors):
     np.testing.assert_allclose(found[3:, :, filters], wanted[1:, :, filters], atol=1e-8 * np.abs(wanted).max())
 
 
+def test_a_wrong_sample_right_after_a_gap_is_missing_too_and_noise_widens_gates(motors):
+    observer, batch = motors
+    y, size = batch.states[..., :1].copy(), np.abs(batch.states[..., 0]).max()
+    y[200:230] = np.nan
+    wrong, missing, noise = y.copy(), y.copy(), 0.5 * observer.bank.gate * np.random.default_rng(1).normal(size=y.shape)
+    wrong[230], missing[230] = y[230] + 0.3 * size, np.nan
+    np.testing.assert_array_equal(*(run_observer(observer, each, batch.inputs) for each in (wrong, missing)))
+    status = run_with_status(observer, y + noise, batch.inputs)[1]
+    assert np.mean(status[300:] & SampleStatus.LIMIT > 0) < 0.5  # without, most are refused
+
+
 @pytest.mark.parametrize("fault", ["stuck", "shifted for good"])
 def test_a_sensor_that_is_wrong_for_long_is_believed_again_and_its_fault_forgotten(motors, fault):
     observer, batch = motors

@@ -122,7 +122,9 @@ def test_a_recording_in_blocks_is_run_as_a_whole(kind, delay, loops, monkeypatch
         A_b = np.zeros((9, 9))
         A_b[:2, [0, 2]], A_b[2:4, 0], A_b[2:4, 2:4] = [[0.9, 0.1], [0.2, 0.5]], 0.1, np.diag([0.8, 0.5])
         A_b[4, 4], A_b[5:7, 2], A_b[7:9, 4] = 0.9, 0.2, 0.3
-        of_gaps = map(np.array, ([0.95], [[0.2, 0.1], [0.1, 0.3]], [0.2, 0.5], [0.5], [0.05], [0.2], [0.5], [4.0]))
+        of_gaps = map(
+            np.array, ([0.95], [[0.2, 0.1], [0.1, 0.3]], [0.2, 0.5], *([v] for v in (0.5, 0.05, 0.2, 0.5, 4, 2)))
+        )
         bank = FilterBank(2, 0.1 * np.ones((9, 10)), *of_gaps)
         lifting = Lifting(("x", "v", "z1", "z2", "w", "xs", "vs", "xu", "vu"))
         still = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((9, 0)), np.zeros((9, 1)), DT)

@@ -64,13 +64,14 @@ typedef struct {
     const double *noise;      /* (q): errors of one step */
     const double *rest;       /* (q): errors of a first step where nothing has moved before */
     const double *gate;       /* (q) */
-    const double *opening;    /* (q): how much wider gates are after a start */
+    const double *opening;    /* (q): how much wider gates are after a start, */
+    const double *deviations; /* (q) and in standard deviations of what is not known */
     const double *start;      /* (filters, n_lifted + n_inputs) */
     const double *limits;     /* (2, recorded): of estimates before the fallback enters them */
     const double *half;       /* (recorded) */
     const double *recovery;   /* (1) */
     const double *doubt;      /* (filters, filters): covariance at a start */
-    double *gap;              /* (3 q + 1 + (filters + q)^2, batch): counts of refused and believed, widths of gates, age of the last start, covariance; moved on */
+    double *gap;              /* (4 q + 1 + (filters + q)^2, batch): counts of refused and believed, widths of gates, unrest, age of the last start, covariance; moved on */
     double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
 
@@ -237,10 +238,7 @@ static int any(mask where)
     return some != 0;
 }
 
-static vec clipped(vec value, vec low, vec high)
-{
-    return either(value < low, low, either(value > high, high, value));
-}
+static vec clipped(vec value, vec low, vec high) { return either(value < low, low, either(value > high, high, value)); }
 
 static vec root(vec x) { for (whole b = 0; b < WIDE; b++) x[b] = sqrt(x[b]); return x; }
 
@@ -248,7 +246,7 @@ static vec root(vec x) { for (whole b = 0; b < WIDE; b++) x[b] = sqrt(x[b]); ret
 
 /* Gaps of a filter bank, see kros.observer.filter_bank for the symbols. */
 struct gaps {
-    vec *gap;          /* (3 q + 1): as in the job, */
+    vec *gap;          /* (4 q + 1): as in the job, */
     vec *spread;       /* (MOST, filters + q, filters + q): and the covariance */
     vec *by;           /* (recorded + filters, q): slopes by the measurements */
     vec *moved;        /* (recorded + filters, filters + q): T P */
@@ -263,18 +261,19 @@ static void fill(const relift_job *s, const struct gaps *g, vec *reg, vec *y, wh
 {
     const whole r = s->filters, q = s->q, recorded = s->recorded, size = r + q;
     for (whole v = 0; v < w; v++) {
-        vec *start = g->gap + 3 * q * MOST + v, *spread = g->spread + v * size * size, column[size];
+        vec *start = g->gap + 4 * q * MOST + v, *spread = g->spread + v * size * size, column[size];
         mask waits = *start > OLDEST, anew = {0}, complete = ~anew;
         for (whole j = 0; j < q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
-            vec *refusals = g->gap + row, *believed = refusals + q * MOST, *width = believed + q * MOST;
-            const vec seen = y[row], apart = either(seen > reg[i], seen - reg[i], reg[i] - seen), wide = root(1.0 + SPREAD(r + j, r + j) / (s->noise[j] * s->noise[j]));
-            const vec near = s->gate[j] * (1.0 + s->opening[j] / (1.0 + *believed));
+            vec *refusals = g->gap + row, *believed = refusals + q * MOST, *width = believed + q * MOST, *unrest = width + q * MOST;
+            const vec seen = y[row], apart = either(seen > reg[i], seen - reg[i], reg[i] - seen), wide = s->deviations[j] * root(SPREAD(r + j, r + j));
+            const vec near = s->gate[j] * (1.0 + *unrest) * (1.0 + s->opening[j] / (1.0 + *believed));
             const mask arrived = seen - seen == 0.0, outvoted = (*refusals >= (double)s->patience) | (*refusals >= *believed);
             *width = either((*refusals > 0.0) & arrived, *width, wide);
-            const mask refused = (apart > near * *width * (1.0 + *refusals)) & ~waits & ~outvoted;
-            const mask starts = (apart > near * wide) & (*refusals > 0.0) & ~refused & ~waits;
+            const mask refused = (apart > (near + *width) * (1.0 + *refusals)) & ~waits & ~outvoted;
+            const mask starts = (apart > near + wide) & (*refusals > 0.0) & ~refused & ~waits;
             *believed = either(starts, (vec){0}, *believed);
+            *unrest = either(arrived & ~refused, either(*refusals > *unrest * s->recovery[0], *refusals, *unrest * s->recovery[0]), *unrest);
             anew |= starts;
             *refusals = either(refused, *refusals + 1.0, either(arrived, (vec){0}, *refusals));
             g->missing[row] = ~arrived | refused;
@@ -322,7 +321,7 @@ static void restart(const relift_job *s, const formulas *f, const struct gaps *g
 {
     const whole columns = f->n_lifted + f->n_inputs, q = s->q, size = s->filters + q;
     for (whole v = 0; v < w; v++) {
-        vec *start = g->gap + 3 * q * MOST + v, *spread = g->spread + v * size * size;
+        vec *start = g->gap + 4 * q * MOST + v, *spread = g->spread + v * size * size;
         mask begins = *start > OLDEST;
         for (whole j = 0; j < q; j++) begins &= ~g->missing[j * MOST + v];
         if (!any(begins)) continue;
@@ -397,7 +396,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
 {
     const whole q = s->q, recorded = s->recorded;
     for (whole v = 0; v < w; v++) {
-        vec *start = g->gap + 3 * q * MOST + v, variance[recorded];
+        vec *start = g->gap + 4 * q * MOST + v, variance[recorded];
         const mask waits = *start > OLDEST;
         const vec age = *start * *start, begun = age / (1.0 + age);
         const int uncertain = spread_on(f, reg, s, g, variance, columns, v);
@@ -423,7 +422,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, size = s->filters + q, ages = recorded ? 3 * q + 1 : 0, known = recorded ? recorded + s->filters : 0;
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, size = s->filters + q, ages = recorded ? 4 * q + 1 : 0, known = recorded ? recorded + s->filters : 0;
     struct gaps g = {vectors(ages), vectors(recorded ? size * size : 0), room(known * q * (whole)sizeof(vec)), room(known * size * (whole)sizeof(vec)), room(known * s->filters * (whole)sizeof(whole)), room(known * (whole)sizeof(whole)), (mask *)vectors(q)};
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;

@@ -134,8 +134,9 @@ class ObserverData:
             shapes = tuple(getattr(bank, key).shape for key in ("start", "half", "recovery", "doubt"))
             wanted = (n, rows + columns), recorded, (1,), (bank.filters,) * 2
             self._require("start, half, recovery and doubt", shapes, wanted)
-            of_measurements = tuple(getattr(bank, key).shape for key in ("reach", "noise", "rest", "gate", "opening"))
-            self._require("reach, noise, rest, gate and opening", of_measurements, ((q,),) * 5)
+            names = ("reach", "noise", "rest", "gate", "opening", "deviations")
+            of_measurements = tuple(getattr(bank, key).shape for key in names)
+            self._require(", ".join(names), of_measurements, ((q,),) * len(names))
             if not 0 <= bank.filters <= (most := n - 3 * recorded[0]) or K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, and of its states at most {most} filters "

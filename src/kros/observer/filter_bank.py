@@ -32,13 +32,16 @@ After a start where nothing has moved before, :math:`x + m (x^s - x)` takes the 
 a^2)`, with an age a that begins at :math:`0.1 e^5` and falls by a factor a sample. The first step decides: where its
 errors are like those of recorded starts, P is zero from then on, and otherwise a.
 
-A measurement is refused, and counts as missing, where it is further from its estimate than :math:`b (1 + w / (1 + k))
-\sqrt{1 + P_{jj} / n_j^2} (1 + r)`; b is the gate, k are the measurements that were believed since a start, r those that
-were refused just before, and P is that before these. After as many refused in a row as were believed, or as a start
-takes, any measurement is believed. One that is believed after refusals, and is further away than P says by then, is a
-start: what was known is of no use. The filters z start again, if all measurements are there, and those of inputs
-go on. At a start without all measurements, inputs alone count until the first sample that has them; there the filters z
-start.
+A measurement is refused, and counts as missing, where it is further from its estimate than
+
+.. math:: (b (1 + v) (1 + w / (1 + k)) + d \sqrt{P_{jj}}) (1 + r),
+
+b the gate, k the measurements that were believed since a start, r those that were refused just before; P is that
+before these. v is the largest r after which one was believed, and is forgotten as a start is: where measurements are
+worse than in training, gates are wider. After as many refused in a row as were believed, or as a start takes, any
+measurement is believed. One that is believed after refusals, and is further away than P says by then, is a start: what
+was known is of no use. The filters z start again, if all measurements are there, and those of inputs go on. At a start
+without all measurements, inputs alone count until the first sample that has them; there the filters z start.
 """
 
 from __future__ import annotations
@@ -66,13 +69,14 @@ class FilterBank:
     rest: Array  # (q,), errors of a first step where nothing has moved before
     gate: Array  # (q,)
     opening: Array  # (q,), w
+    deviations: Array  # (q,), d
 
     def __post_init__(self) -> None:
         floats(self, "Filter bank", start="finite numbers", recovery="shares between 0 and 1", rest="positive")
         floats(self, "Filter bank", gate="positive")
         floats(self, "Filter bank", half="positive and finite", noise="positive and finite")
         floats(self, "Filter bank", reach="finite and not negative", opening="finite and not negative")
-        floats(self, "Filter bank", doubt="finite numbers")
+        floats(self, "Filter bank", doubt="finite numbers", deviations="finite and not negative")
 
     @property
     def patience(self) -> int:
@@ -101,14 +105,14 @@ class Gaps:
         self.errors, self.from_inputs = slice(n - 2 * recorded, n - recorded), slice(n - recorded, n)
         self._from_filters = A[: self.filters.stop, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
-        self.take(np.zeros((3 * len(measured) + 1 + (bank.filters + len(measured)) ** 2, batch)))
+        self.take(np.zeros((4 * len(measured) + 1 + (bank.filters + len(measured)) ** 2, batch)))
 
     def take(self, state: Array) -> None:
-        """Go on from a state: refused and believed measurements, widths of gates, age of the last start, covariance."""
+        """Go on from a state: refused and believed measurements, gates, age of the last start, and covariance."""
         q = len(self.measured)
         self.state = state
-        self.refusals, self.believed, self.width, self.start, spread = np.split(
-            state.T, np.cumsum([q, q, q, 1]), axis=1
+        self.refusals, self.believed, self.width, self.unrest, self.start, spread = np.split(
+            state.T, np.cumsum([q, q, q, q, 1]), axis=1
         )
         self.spread = spread.reshape(len(spread), q + self.bank.filters, -1)
 
@@ -132,15 +136,17 @@ class Gaps:
     def gated(self, x: Array, y: Array) -> Array:
         """Return measurements (batch, q), NaN in place of those that are too far from their estimates to be true."""
         apart, bank, waiting = abs(y - x[:, self.measured]), self.bank, self.waiting[:, None]
-        near = bank.gate * (1 + bank.opening / (1 + self.believed))
-        width = np.sqrt(1 + self.variance / bank.noise**2)
+        near = bank.gate * (1 + self.unrest) * (1 + bank.opening / (1 + self.believed))
+        width = bank.deviations * np.sqrt(self.variance)
         self.width[...] = np.where((self.refusals > 0) & np.isfinite(y), self.width, width)
-        far = (apart > near * self.width * (1 + self.refusals)) & ~waiting
+        far = (apart > (near + self.width) * (1 + self.refusals)) & ~waiting
         refused = far & (self.refusals < np.minimum(bank.patience, self.believed))
-        starts = (apart > near * width) & (self.refusals > 0) & ~refused & ~waiting
+        starts = (apart > near + width) & (self.refusals > 0) & ~refused & ~waiting
         shown = np.where(refused, np.nan, y)
         self.start[starts.any(axis=1) & np.isfinite(shown).all(axis=1)] = _WAITING
         self.believed[starts] = 0.0
+        unrest = np.maximum(self.unrest * bank.recovery, self.refusals)
+        self.unrest[...] = np.where(np.isfinite(shown), unrest, self.unrest)
         self.refusals[...] = np.where(np.isfinite(y), refused * (self.refusals + 1), self.refusals)
         return shown
 
@@ -230,6 +236,7 @@ class Gaps:
             "rest": bank.rest,
             "gate": bank.gate,
             "opening": bank.opening,
+            "deviations": bank.deviations,
             "start": bank.start[self.filters],
             "patience": bank.patience,
             "limits": np.array(self.limits),

@@ -50,8 +50,9 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
 def with_errors(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
     """Return the observer's bank with errors of one step, gates, doubts at a start, and the fallback's RMS errors.
 
-    Gates, b and w, are several times the largest distances of measurements from their estimates in training, of starts
-    amid its episodes too, and `rest` of the first step of its episodes. The fallback's errors stand in `half`.
+    Gates, b, w and d, are several times the largest distances of measurements from their estimates in training, of
+    starts amid its episodes too, where d is by the first step; and `rest` is several times the largest of the first
+    step of its episodes. The fallback's errors stand in `half`.
     """
     assert observer.bank is not None
     bank, n, at = observer.bank, len(observer.recorded), list(observer.measured)
@@ -75,10 +76,11 @@ def with_errors(observer: Observer, recordings: Recordings, settings: EstimatorS
     shown, inputs = (np.hstack(np.split(v[: count * start], count)) for v in (y, inputs))
     again = {name: np.tile(values, count) for name, values in own.items()}
     estimates = whole_estimates(replace(observer, bank=known), shown, inputs, again)
-    ratio = np.hypot(1, estimates[..., -2 * n : -n][..., at] / noise)
-    begun = (abs(shown - estimates[..., at]) / ratio).max(axis=1) / largest
-    opening = ((begun - 1) * np.arange(1, start + 1)[:, None]).max(axis=0, initial=0.0)
-    return replace(known, opening=opening)
+    apart, unsure = abs(shown - estimates[..., at])[1:], estimates[1:, :, -2 * n : -n][..., at]
+    deviations = (apart[0] / np.maximum(unsure[0], noise)).max(axis=0)
+    begun = (apart - deviations * unsure).max(axis=1) / largest
+    opening = ((begun - 1) * np.arange(2, start + 1)[:, None]).max(axis=0, initial=0.0)
+    return replace(known, opening=opening, deviations=settings.gate * deviations)
 
 
 def with_fallback(

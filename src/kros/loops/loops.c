@@ -299,7 +299,7 @@ static void fill(const relift_job *s, const struct gaps *g, vec *reg, vec *y, wh
                 uncertain |= column[k] != 0.0;
             }
             if (any(uncertain & arrived)) {
-                const vec share = either(arrived, 1.0 / (column[at] + variance), (vec){0}), moved = share * either(arrived, y[j * MOST + v] - reg[i], (vec){0});
+                const vec known = 1.0 + g->gap[(q + j) * MOST + v], share = either(arrived, 1.0 / (column[at] + column[at] / (known * known * known * known) + variance), (vec){0}), moved = share * either(arrived, y[j * MOST + v] - reg[i], (vec){0});
                 for (whole k = 0; k < r; k++) reg[(recorded + k) * MOST + v] += column[k] * moved;
                 for (whole k = 0; k < q; k++) reg[s->measured[k] * MOST + v] += column[r + k] * moved;
                 for (whole k = 0; k < size; k++)

@@ -16,8 +16,10 @@ model says what filters and substitutes are worth: with P the covariance of the 
 
 and z and the other substitutes move by :math:`K_j (y_j - s_j)` for each measurement j that arrives, whose error is
 zero then; that of a missing one gets the variance :math:`n_j^2`. At a start z is what it is where nothing has moved
-before, and P its error amid training episodes. As A is stable, all this is forgotten: P is set to zero where it changes
-no estimate, and nothing is corrected any more. Functions of measurements enter b and D by their slopes.
+before, and P its error amid training episodes; a linear model says little of errors that large, and in :math:`K_j`,
+:math:`P_{jj}` counts :math:`1 + (1 + k)^{-4}` times, k measurements after it. As A is stable, all this is forgotten: P
+is set to zero where it changes no estimate, and nothing is corrected any more. Functions of measurements enter b and D
+by their slopes.
 
 Of states that are not measured, what follows from z is blended with the fallback as both are worth,
 
@@ -158,7 +160,7 @@ class Gaps:
         for j, variance in enumerate(self.bank.noise**2):
             arrived, lost = knows & ~missing[:, j], knows & missing[:, j]
             column = spread[:, :, r + j].copy()
-            share = arrived / (column[:, r + j] + variance)
+            share = arrived / (column[:, r + j] * (1 + (1 + self.believed[:, j]) ** -4) + variance)
             step = column * (share * np.where(arrived, y[:, j] - expected[:, j], 0.0))[:, None]
             x[:, self.filters] += step[:, :r]
             expected += step[:, r:]

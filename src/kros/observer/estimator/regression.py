@@ -29,6 +29,7 @@ class Whitening:
 
     sample: Array  # triangle of thinned rows, from which they are found
     directions: Array  # (p, r)
+    inverse: Array  # (r, p), rows of the bank by their parts in these directions
     penalty: Array  # (r,), 1 / sigma^2
     trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
     disturbed: Array  # (r, r), the same after a start in the middle of an episode
@@ -44,9 +45,10 @@ class Whitening:
         starts = np.sqrt(settings.settled_share) * disturbed, np.sqrt(settings.start_share) * elsewhere
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([sample.rows / size, trust, *starts])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
-        directions = V[:count].T / sigma[:count]
+        sigma, V = sigma[:count], V[:count]
+        directions, inverse = V.T / sigma, sigma[:, None] * V * size
         moments = (rows.T @ rows for rows in (each @ directions for each in (trust, disturbed, elsewhere)))
-        return cls(sample.rows, directions / size[:, None], sigma[:count] ** -2.0, *moments)
+        return cls(sample.rows, directions / size[:, None], inverse, sigma**-2.0, *moments)
 
 
 @frozen
@@ -63,24 +65,27 @@ class Moments:
     @classmethod
     def of(cls, designs: Sequence[Design], whitenings: Sequence[Whitening]) -> list[Moments]:
         """Sum the rows of every group, for every design: their banks are parts of that of the last."""
-        last, n = designs[-1], len(designs[-1].recordings.size)
+        last, whitening = designs[-1], whitenings[-1]
         some = last.recordings.some(last.settings.episodes, last.groups)
-        places = [last.bank.places(design.bank) for design in designs]
         groups = tuple(dict.fromkeys(last.groups[key] for key in some.keys))
-        count, sizes = len(groups), [len(whitening.penalty) for whitening in whitenings]
-        total, power = np.zeros(count), np.zeros((count, n))
-        moments = [(np.zeros((count, r, r)), np.zeros((count, r, n))) for r in sizes]
+        count, r, n = len(groups), len(whitening.penalty), len(last.recordings.size)
+        gram, cross, power, total = (np.zeros((count, *shape)) for shape in ((r, r), (r, n), (n,), ()))
         for key, rows, targets, weights in last.rows(some, last.settings.rows):
             group, root = groups.index(last.groups[key]), np.sqrt(weights)[:, None]
+            white, wanted = root * (rows @ whitening.directions), root * targets
+            gram[group] += white.T @ white
+            cross[group] += white.T @ wanted
+            power[group] += (wanted**2).sum(axis=0)
             total[group] += weights.sum()
-            power[group] += weights @ targets**2
-            for (gram, cross), whitening, entries in zip(moments, whitenings, places, strict=True):
-                white = root * (rows[:, entries] @ whitening.directions)
-                gram[group] += white.T @ white
-                cross[group] += white.T @ (root * targets)
-        for values in (power, *(value for pair in moments for value in pair)):
-            values /= total.reshape(-1, *[1] * (values.ndim - 1))
-        return [cls(w, groups, *pair, power, total) for w, pair in zip(whitenings, moments, strict=True)]
+        each = total[:, None]
+        whole = cls(whitening, groups, gram / each[..., None], cross / each[..., None], power / each, total)
+        parts = zip(whitenings[:-1], (last.bank.places(design.bank) for design in designs), strict=False)
+        return [*(whole.part(whitening, entries) for whitening, entries in parts), whole]
+
+    def part(self, whitening: Whitening, entries: Whole) -> Moments:
+        """Return the moments of some entries of the bank, in their own directions."""
+        into = self.whitening.inverse[:, entries] @ whitening.directions
+        return replace(self, whitening=whitening, gram=into.T @ self.gram @ into, cross=into.T @ self.cross)
 
     def of_groups(self, what: str) -> AnyArray:
         """Return fold, condition or part of every group."""

@@ -268,7 +268,7 @@ static void fill(const relift_job *s, const struct gaps *g, vec *reg, vec *y, wh
             vec *refusals = g->gap + row, *believed = refusals + q * MOST, *width = believed + q * MOST, *unrest = width + q * MOST;
             const vec seen = y[row], apart = either(seen > reg[i], seen - reg[i], reg[i] - seen), wide = s->deviations[j] * root(SPREAD(r + j, r + j));
             const vec near = s->gate[j] * (1.0 + *unrest) * (1.0 + s->opening[j] / (1.0 + *believed));
-            const mask arrived = seen - seen == 0.0, outvoted = (*refusals >= (double)s->patience) | (*refusals >= *believed);
+            const mask arrived = seen - seen == 0.0, outvoted = (*refusals >= (double)s->patience) | (*refusals + *unrest >= *believed);
             *width = either((*refusals > 0.0) & arrived, *width, wide);
             const mask refused = (apart > (near + *width) * (1.0 + *refusals)) & ~waits & ~outvoted;
             const mask starts = (apart > near + wide) & (*refusals > 0.0) & ~refused & ~waits;

@@ -40,10 +40,10 @@ A measurement is refused, and counts as missing, where it is further from its es
 
 b the gate, k the measurements that were believed since a start, r those that were refused just before; P is that
 before these. v is the largest r after which one was believed, and is forgotten as a start is: where measurements are
-worse than in training, gates are wider. After as many refused in a row as were believed, or as a start takes, any
-measurement is believed. One that is believed after refusals, and is further away than P says by then, is a start: what
-was known is of no use. The filters z start again, if all measurements are there, and those of inputs go on. At a start
-without all measurements, inputs alone count until the first sample that has them; there the filters z start.
+worse than in training, gates are wider. After as many refused in a row as were believed, less v, or as a start takes,
+any measurement is believed. One that is believed after refusals, and is further away than P says by then, is a start:
+what was known is of no use. The filters z start again, if all measurements are there, and those of inputs go on. At a
+start without all measurements, inputs alone count until the first sample that has them; there the filters z start.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Gaps:
         width = bank.deviations * np.sqrt(self.variance)
         self.width[...] = np.where((self.refusals > 0) & np.isfinite(y), self.width, width)
         far = (apart > (near + self.width) * (1 + self.refusals)) & ~waiting
-        refused = far & (self.refusals < np.minimum(bank.patience, self.believed))
+        refused = far & (self.refusals < np.minimum(bank.patience, self.believed - self.unrest))
         starts = (apart > near + width) & (self.refusals > 0) & ~refused & ~waiting
         shown = np.where(refused, np.nan, y)
         self.start[starts.any(axis=1) & np.isfinite(shown).all(axis=1)] = _WAITING

@@ -336,6 +336,10 @@ def test_an_input_that_is_lost_is_held_and_starts_nothing_anew(motors):
     lost[100:150], held[100:150] = np.nan, u[99]
     wanted = run_observer(observer, y, held)
     np.testing.assert_array_equal(run_observer(observer, y, lost), wanted)
+    moved = y + np.where(np.arange(len(y)) == 120, 2 * observer.bank.gate, 0.0)[:, None, None]
+    refused = [run_with_status(observer, moved, each)[1][120] & SampleStatus.LIMIT > 0 for each in (lost, u)]
+    assert not refused[0].any()  # the input may be wrong
+    assert refused[1].all()
     running = observer.start(y[0, 0])
     unknown = np.isnan(lost[:, 0]).all(axis=-1)
     rows = [np.asarray(running.step(y[k, 0], None if unknown[k] else lost[k, 0])) for k in range(499)]

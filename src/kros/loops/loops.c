@@ -52,6 +52,7 @@ typedef struct {
     whole filters;     /* states behind the first ones, which are corrected when a measurement returns */
     whole patience;    /* measurements refused in a row, after which one is believed */
     const double *map;        /* (n + order, n_lifted + order + n_inputs + q) */
+    const uint8_t *unsure;    /* (samples, batch): whether an input is not known; none */
     double *y;                /* (samples, q, batch); none where nothing is measured; of filter banks NaN in the end where refused */
     const double *u;          /* (samples, m, batch) */
     const int32_t *measured;  /* (q) */
@@ -231,12 +232,7 @@ static int within(const relift_job *s, whole rows, const vec *next, whole lanes)
     return inside;
 }
 
-static int any(mask where)
-{
-    int64_t some = 0;
-    for (whole b = 0; b < WIDE; b++) some |= where[b];
-    return some != 0;
-}
+static int any(mask where) { int64_t some = 0; for (whole b = 0; b < WIDE; b++) some |= where[b]; return some != 0; }
 
 static vec clipped(vec value, vec low, vec high) { return either(value < low, low, either(value > high, high, value)); }
 
@@ -294,10 +290,7 @@ static void fill(const relift_job *s, const struct gaps *g, vec *reg, vec *y, wh
             const mask lost = g->missing[j * MOST + v] & ~waits, arrived = ~g->missing[j * MOST + v] & ~waits;
             const vec variance = (vec){0} + s->noise[j] * s->noise[j];
             mask uncertain = {0};
-            for (whole k = 0; k < size; k++) {
-                column[k] = SPREAD(k, at);
-                uncertain |= column[k] != 0.0;
-            }
+            for (whole k = 0; k < size; k++) uncertain |= (column[k] = SPREAD(k, at)) != 0.0;
             if (any(uncertain & arrived)) {
                 const vec known = 1.0 + g->gap[(q + j) * MOST + v], share = either(arrived, 1.0 / (column[at] + column[at] / (known * known * known * known) + variance), (vec){0}), moved = share * either(arrived, y[j * MOST + v] - reg[i], (vec){0});
                 for (whole k = 0; k < r; k++) reg[(recorded + k) * MOST + v] += column[k] * moved;
@@ -472,6 +465,8 @@ int kros_relift(const formulas *f, const relift_job *s)
                     y[j * MOST + v] = either(seen - seen == 0.0, seen, x[v]);
                 }
             }
+            for (whole i = 0; i < q * lanes && recorded; i++)
+                if (s->unsure[k * batch + first + i % lanes]) LANES(g.gap + (q + i / lanes) * MOST)[i % lanes] = 0.0;
             if (recorded) fill(s, &g, reg, y, n, w);
             for (whole j = 0; j < q && recorded; j++) {
                 for (whole v = 0; v < w; v++) next[v] = either(g.missing[j * MOST + v], (vec){0} + NAN, y[j * MOST + v]);

@@ -96,6 +96,7 @@ class Screened:
     u: Array  # (n_samples, batch, m)
     status: Bits  # (n_samples, batch)
     starts: Flags  # (n_samples, batch)
+    unsure: Flags  # (n_samples, batch); An input is not known, nor does it go on with its slope
     complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
 
@@ -158,7 +159,8 @@ class Screen:
         complete = np.asarray(good.all(axis=-1) & self.enough(plausible[..., :q]))
         starts, stale = _starts(lost, complete, before.stale)
         y = np.where(plausible, within, np.nan)[..., :q]
-        return Screened(y, inputs, status, starts, complete, Held(last[-1], slopes[-1], since[-1], stale))
+        unsure = np.asarray((since > LONGEST).any(axis=-1))
+        return Screened(y, inputs, status, starts, unsure, complete, Held(last[-1], slopes[-1], since[-1], stale))
 
 
 def screened(observer: ObserverData, y: ArrayLike, u: ArrayLike, held: Held | None = None) -> Screened:

@@ -188,6 +188,8 @@ def stepped(course: Course, samples: Screened) -> Stepped:
             steps.begin(y, starts[k], samples.u[k])
             if loop is not None:
                 loop.begin(starts[k])
+        if steps.gaps is not None:
+            steps.gaps.believed[samples.unsure[k]] = 0.0
         nu[k] = np.where(np.isfinite(y), steps.innovation(y), 0.0)
         moving[k] = (course.since == d) & ~steps.waiting
         if loop is None:
@@ -213,6 +215,7 @@ def _compiled(loops: Library, course: Course, samples: Screened) -> Stepped | No
     entries, y = () if steps.gaps is None else observer.measured, samples.y[first:].swapaxes(1, 2).copy()
     of_lifting = formulas(observer.lifting, course.values, u.shape[2], batch, entries)
     job = steps.job | {"samples": n_samples - first, "batch": batch, "states": states[first:]}
+    job |= {"unsure": samples.unsure[first:].view(np.uint8)} if entries else {}
     job |= {"y": y, "u": u[begin : begin + n_samples - first].swapaxes(1, 2)}
     loops.call("kros_relift", of_lifting, ("relift_job", job))
     if job["left"]:

@@ -77,15 +77,17 @@ class Moments:
             cross[group] += white.T @ wanted
             power[group] += (wanted**2).sum(axis=0)
             total[group] += weights.sum()
-        each = total[:, None]
-        whole = cls(whitening, groups, gram / each[..., None], cross / each[..., None], power / each, total)
+        for sums in (gram, cross, power):
+            np.divide(sums.T, total, out=sums.T)
+        whole = cls(whitening, groups, gram, cross, power, total)
         parts = zip(whitenings[:-1], (last.bank.places(design.bank) for design in designs), strict=False)
         return [*(whole.part(whitening, entries) for whitening, entries in parts), whole]
 
     def part(self, whitening: Whitening, entries: Whole) -> Moments:
         """Return the moments of some entries of the bank, in their own directions."""
         into = self.whitening.inverse[:, entries] @ whitening.directions
-        return replace(self, whitening=whitening, gram=into.T @ self.gram @ into, cross=into.T @ self.cross)
+        gram = np.array([into.T @ one @ into for one in self.gram])
+        return replace(self, whitening=whitening, gram=gram, cross=into.T @ self.cross)
 
     def of_groups(self, what: str) -> AnyArray:
         """Return fold, condition or part of every group."""

@@ -236,7 +236,7 @@ static int any(mask where) { int64_t some = 0; for (whole b = 0; b < WIDE; b++) 
 
 static vec clipped(vec value, vec low, vec high) { return either(value < low, low, either(value > high, high, value)); }
 
-static vec root(vec x) { for (whole b = 0; b < WIDE; b++) x[b] = sqrt(x[b]); return x; }
+static vec root(vec x) { for (whole b = 0; b < WIDE; b++) x[b] = x[b] > 0.0 ? sqrt(x[b]) : 0.0; return x; }
 
 #define OLDEST (0.1 * exp(5.0)) /* age of a start; twice as much until a sample has all measurements */
 
@@ -292,7 +292,8 @@ static void fill(const relift_job *s, const struct gaps *g, vec *reg, vec *y, wh
             mask uncertain = {0};
             for (whole k = 0; k < size; k++) uncertain |= (column[k] = SPREAD(k, at)) != 0.0;
             if (any(uncertain & arrived)) {
-                const vec known = 1.0 + g->gap[(q + j) * MOST + v], share = either(arrived, 1.0 / (column[at] + column[at] / (known * known * known * known) + variance), (vec){0}), moved = share * either(arrived, y[j * MOST + v] - reg[i], (vec){0});
+                const vec count = 1.0 + g->gap[(q + j) * MOST + v], large = column[at] / (count * count * count * count);
+                const vec share = either(arrived, 1.0 / (column[at] + large + variance), (vec){0}), moved = share * either(arrived, y[j * MOST + v] - reg[i], (vec){0});
                 for (whole k = 0; k < r; k++) reg[(recorded + k) * MOST + v] += column[k] * moved;
                 for (whole k = 0; k < q; k++) reg[s->measured[k] * MOST + v] += column[r + k] * moved;
                 for (whole k = 0; k < size; k++)

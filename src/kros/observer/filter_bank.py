@@ -134,7 +134,7 @@ class Gaps:
     @property
     def variance(self) -> Array:
         """Variances of the errors of measurements' estimates by what is missing, (batch, q)."""
-        return np.diagonal(self.spread, axis1=1, axis2=2)[:, self.bank.filters :]
+        return np.maximum(np.diagonal(self.spread, axis1=1, axis2=2)[:, self.bank.filters :], 0.0)  # up to rounding
 
     def gated(self, x: Array, y: Array) -> Array:
         """Return measurements (batch, q), NaN in place of those that are too far from their estimates to be true."""

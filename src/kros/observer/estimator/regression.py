@@ -80,8 +80,8 @@ class Moments:
         for sums in (gram, cross, power):
             np.divide(sums.T, total, out=sums.T)
         whole = cls(whitening, groups, gram, cross, power, total)
-        parts = zip(whitenings[:-1], (last.bank.places(design.bank) for design in designs), strict=False)
-        return [*(whole.part(whitening, entries) for whitening, entries in parts), whole]
+        parts = zip(whitenings[:-1], designs[:-1], strict=True)
+        return [*(whole.part(one, last.bank.places(design.bank)) for one, design in parts), whole]
 
     def part(self, whitening: Whitening, entries: Whole) -> Moments:
         """Return the moments of some entries of the bank, in their own directions."""
@@ -110,11 +110,12 @@ class Moments:
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 1 + 16 * len(gram) * EPS
         whole = {
-            tuple(each): gram + each[0] * whitening.elsewhere + each[1] * whitening.disturbed for _, *each in candidates
+            (start, restart): gram + start * whitening.elsewhere + restart * whitening.disturbed
+            for start, restart in {candidate[1:] for candidate in candidates}
         }
         found = np.zeros((len(candidates), *cross.shape))
-        for i, (penalty, *each) in enumerate(candidates):
-            A = whole[tuple(each)].copy()
+        for i, (penalty, start, restart) in enumerate(candidates):
+            A = whole[start, restart].copy()
             A.flat[:: len(A) + 1] = rounding * (np.diag(A) + penalty * whitening.penalty)
             factor = cho_factor(A.T, lower=True, overwrite_a=True, check_finite=False)  # as LAPACK stores it: no copies
             found[i] = cho_solve(factor, cross, check_finite=False)

@@ -9,6 +9,7 @@ import pytest
 from batches import batch_of, run_with_status
 from machines import filters
 from recorded_plant import DT, FEW, LIFTING, estimator, plant, recorded_motors
+from scipy.signal import lfilter
 
 import kros
 from kros.core.errors import ConfigError
@@ -16,22 +17,14 @@ from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
 from kros.evaluate.sensor import as_shown
 from kros.lifting import Lifting
-from kros.observer import (
-    EstimatorSettings,
-    Observer,
-    Recordings,
-    SampleStatus,
-    Sensor,
-    identify_estimator,
-    run_observer,
-)
+from kros.observer import EstimatorSettings, Observer, Recordings, SampleStatus, Sensor, identify_estimator
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.reduction import Filters, reduced
 from kros.observer.estimator.regression import Moments, Readout, Whitening, condition_weights
 from kros.observer.estimator.rows import Design
-from kros.observer.simulate import Course
+from kros.observer.simulate import Course, run_observer
 
 
 def design(recordings, family="linear", settings=FEW, largest_input=3.0):
@@ -329,13 +322,15 @@ def test_any_pattern_of_losses_leaves_the_estimate_bounded_and_is_forgotten(moto
     assert (apart[-1] <= apart[300:].max(axis=0) + 1e-12).all()
 
 
-def test_an_input_that_is_lost_is_held_and_starts_nothing_anew(motors):
+@pytest.mark.parametrize("persistence", [0.0, 0.8])
+def test_an_input_that_is_lost_goes_on_with_its_change_and_starts_nothing_anew(motors, persistence):
     observer, batch = motors
+    observer = replace(observer, bank=replace(observer.bank, persistence=np.array([persistence])))
     y, u = batch.measurements((0,)), batch.inputs
-    lost, held = u.copy(), u.copy()
-    lost[100:150], held[100:150] = np.nan, u[99]
+    lost, held, going_on = u.copy(), u.copy(), np.cumsum(persistence ** np.arange(1, 51))[:, None, None]
+    lost[100:150], held[100:150] = np.nan, u[99] + going_on * (u[99] - u[98])
     wanted = run_observer(observer, y, held)
-    np.testing.assert_array_equal(run_observer(observer, y, lost), wanted)
+    np.testing.assert_allclose(run_observer(observer, y, lost), wanted, atol=1e-9 * np.abs(wanted).max())
     moved = y + np.where(np.arange(len(y)) == 120, 2 * observer.bank.gate, 0.0)[:, None, None]
     refused = [run_with_status(observer, moved, each)[1][120] & SampleStatus.LIMIT > 0 for each in (lost, u)]
     assert not refused[0].any()  # the input may be wrong
@@ -346,6 +341,14 @@ def test_an_input_that_is_lost_is_held_and_starts_nothing_anew(motors):
     np.testing.assert_allclose(rows, wanted[1:, 0], atol=1e-8 * np.abs(wanted).max())
     assert running.states == tuple(running.estimate) == observer.recorded  # no internal states
     assert wanted.shape[-1] == len(observer.recorded) < observer.lifting.n_states
+
+
+def test_how_changes_of_inputs_last_is_estimated():
+    changes = lfilter([1], [1, -0.9], np.random.default_rng(0).normal(size=(4, 5000)))
+    inputs = {"a": [np.stack([c, np.cumsum(c), np.arange(5000.0)], axis=1) for c in changes]}
+    inputs = kros.from_arrays(inputs, states=["x"], measured=["x"], inputs=["u", "r"], sample_period_s=1.0)
+    found = Recordings.of(list(inputs.keys()), lambda key: EpisodeBatch.read(inputs, [key])).persistence
+    np.testing.assert_allclose(found, [0.9, np.exp(-1 / 5000)], rtol=0.01)
 
 
 @pytest.mark.parametrize("reference", [False, True])

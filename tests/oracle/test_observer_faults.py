@@ -249,9 +249,8 @@ def test_an_input_goes_on_with_its_slope_is_held_then_and_zero_before_the_first(
     late = run_observer(o, y[10:], u[10:])
     bad = u.copy()
     bad[:10] = np.nan
-    np.testing.assert_allclose(
-        run_observer(o, y, bad)[11:], late[1:], rtol=1e-12
-    )  # it starts where it first has everything
+    # it starts where it first has everything
+    np.testing.assert_allclose(run_observer(o, y, bad)[11:], late[1:], rtol=1e-12)
 
 
 def test_reset_leaves_nothing_of_the_past():

@@ -125,7 +125,7 @@ def test_a_recording_in_blocks_is_run_as_a_whole(kind, delay, loops, monkeypatch
         of_gaps = map(
             np.array, ([0.95], [[0.2, 0.1], [0.1, 0.3]], [0.2, 0.5], *([v] for v in (0.5, 0.05, 0.2, 0.5, 4, 2)))
         )
-        bank = FilterBank(2, 0.1 * np.ones((9, 10)), *of_gaps)
+        bank = FilterBank(2, 0.1 * np.ones((9, 10)), *of_gaps, np.array([0.7]))
         lifting = Lifting(("x", "v", "z1", "z2", "w", "xs", "vs", "xu", "vu"))
         still = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((9, 0)), np.zeros((9, 1)), DT)
         o = Observer("b", lifting, A_b, 0.1 * np.ones((9, 1)), (0,), ("u",), still, Injection.STATE, DT, bank=bank)

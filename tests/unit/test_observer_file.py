@@ -122,7 +122,7 @@ def filters(**changes: Any) -> Observer:
     """A filter bank of one filter, and no filter of inputs."""
     states = ("position", "filter_1", "position_error", "position_from_inputs")
     lifting = Lifting(states, (), (), ("torque",), ("1",))
-    ones = dict.fromkeys(("half", "reach", "noise", "rest", "gate", "opening", "deviations"), np.ones(1))
+    ones = dict.fromkeys(("half", "reach", "noise", "rest", "gate", "opening", "deviations", "persistence"), np.ones(1))
     bank = {"filters": 1, "start": np.ones((4, 6)), "recovery": np.array([0.9]), "doubt": np.eye(1), **ones}
     none, made = gain(np.zeros((4, 1)), 0.01), FilterBank(**bank | changes)
     return Observer(

@@ -131,9 +131,9 @@ class ObserverData:
         require_measured(self.sensor, self.outputs)
         if self.bank is not None:
             bank, recorded = self.bank, (len(self.recorded),)
-            shapes = tuple(getattr(bank, key).shape for key in ("start", "half", "recovery", "doubt"))
-            wanted = (n, rows + columns), recorded, (1,), (bank.filters,) * 2
-            self._require("start, half, recovery and doubt", shapes, wanted)
+            shapes = tuple(getattr(bank, key).shape for key in ("start", "half", "recovery", "doubt", "persistence"))
+            wanted = (n, rows + columns), recorded, (1,), (bank.filters,) * 2, (m,)
+            self._require("start, half, recovery, doubt and persistence", shapes, wanted)
             names = ("reach", "noise", "rest", "gate", "opening", "deviations")
             of_measurements = tuple(getattr(bank, key).shape for key in names)
             self._require(", ".join(names), of_measurements, ((q,),) * len(names))

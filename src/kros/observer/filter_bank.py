@@ -73,9 +73,11 @@ class FilterBank:
     gate: Array  # (q,)
     opening: Array  # (q,), w
     deviations: Array  # (q,), d
+    persistence: Array  # (m,), by which factor a change of an input is followed by the next one
 
     def __post_init__(self) -> None:
         floats(self, "Filter bank", start="finite numbers", recovery="shares between 0 and 1", rest="positive")
+        floats(self, "Filter bank", persistence="shares between 0 and 1")
         floats(self, "Filter bank", gate="positive")
         floats(self, "Filter bank", half="positive and finite", noise="positive and finite")
         floats(self, "Filter bank", reach="finite and not negative", opening="finite and not negative")

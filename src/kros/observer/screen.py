@@ -1,17 +1,20 @@
-"""Plausibility of samples: missing, wrong and implausible ones, judged alike for batches and for one machine.
+r"""Plausibility of samples: missing, wrong and implausible ones, judged alike for batches and for one machine.
 
 A sample is judged by itself, before the observer sees it:
 
 | what arrives | what the observer takes | status |
 |---|---|---|
 | a measurement that is missing or not finite | nothing: it corrects nothing | `MISSING` |
-| an input that is not finite | the last good one, five samples on with its slope; zero before | `INVALID_INPUT` |
+| an input that is not finite | the last good one, going on with its last change; zero before | `INVALID_INPUT` |
 | a sample beyond a declared limit | the limit | `LIMIT` |
 | a sample beyond 1.5 times its range | as if it were missing, or not finite | `LIMIT` |
 
 The range is the largest size seen in training, or that of the declared limits; without either a sample has none. So
 nothing that is far from anything possible enters a state, linear or lifted, and what is left of a fault is what the
 model misses while it lasts.
+
+Of a filter bank's input training says by which factor p a change is followed by the next one, and j samples after the
+last good one u stands :math:`u + (p + \dots + p^j) \Delta u`. For other observers p is one, five samples on.
 
 Observers start at a measurement, filter banks at all of them. Where none has arrived yet, or no value of some input,
 the estimate is that from the mean first state of training with the inputs that are known, and the observer starts again
@@ -33,7 +36,7 @@ from .data import ObserverData
 from .runtime import Seen
 
 BEYOND = 1.5  # times the range: what is further away is implausible
-LONGEST = 5  # samples for which an input goes on with its slope; held longer, it makes all but filter banks start anew
+LONGEST = 5  # samples for which an input may be lost; after more, all but filter banks start anew
 NEVER = 2**32 - 1  # samples since an input that was never known
 
 
@@ -45,7 +48,7 @@ class SampleStatus(IntFlag):
     MISSING
         A measurement is missing or not finite. It corrected nothing.
     INVALID_INPUT
-        An input is not finite. The last good value and slope stood for it.
+        An input is not finite. The last good value and change stood for it.
     LIMIT
         A sample is beyond its limit or 1.5 times its range or was refused (see `filter_bank`), or the estimate or the
         correction met a limit that is declared.
@@ -96,7 +99,7 @@ class Screened:
     u: Array  # (n_samples, batch, m)
     status: Bits  # (n_samples, batch)
     starts: Flags  # (n_samples, batch)
-    unsure: Flags  # (n_samples, batch); An input is not known, nor does it go on with its slope
+    unsure: Flags  # (n_samples, batch); An input was lost more than a few samples ago
     complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
 
@@ -111,6 +114,7 @@ class Screen:
     most: Array
     q: int
     longest: int = LONGEST
+    persistence: float | Array = 1.0
     inputs_only: bool = False  # whether inputs are enough to start at, as for filter banks
 
     @classmethod
@@ -118,7 +122,9 @@ class Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
         sides = (side[list(observer.measured)] for side in observer.runtime.sides(observer.lifting.n_states))
         screen = cls.sized(observer.seen, len(observer.measured), len(observer.inputs), *sides)
-        return screen if observer.bank is None else replace(screen, longest=NEVER - 1, inputs_only=True)
+        if observer.bank is None:
+            return screen
+        return replace(screen, longest=NEVER - 1, inputs_only=True, persistence=observer.bank.persistence)
 
     @classmethod
     def sized(
@@ -152,15 +158,22 @@ class Screen:
         since = np.where(latest > 0, count - latest, count + before.since)
         last = np.take_along_axis(np.concatenate([before.inputs[None], within[..., q:]]), latest, axis=0)
         earlier, ago = (np.concatenate([b[None], v[:-1]]) for b, v in ((before.inputs, last), (before.since, since)))
-        changes = (last - earlier) / (ago + 1) * (ago <= LONGEST)
+        changes = (last - earlier) / (ago + 1) * (ago <= self.longest)
         slopes = np.take_along_axis(np.concatenate([before.slopes[None], changes]), latest, axis=0)
-        inputs = np.clip(last + slopes * np.minimum(since, LONGEST), self.least[q:], self.most[q:])
+        lasting = powers(self.persistence, np.minimum(since, self.longest))
+        inputs = np.clip(last + slopes * lasting, self.least[q:], self.most[q:])
         lost = np.asarray((since > self.longest).any(axis=-1))
         complete = np.asarray(good.all(axis=-1) & self.enough(plausible[..., :q]))
         starts, stale = _starts(lost, complete, before.stale)
         y = np.where(plausible, within, np.nan)[..., :q]
         unsure = np.asarray((since > LONGEST).any(axis=-1))
         return Screened(y, inputs, status, starts, unsure, complete, Held(last[-1], slopes[-1], since[-1], stale))
+
+
+def powers(base: float | Array, count: Index) -> Array:
+    """Return the sum of the first powers of a number from 0 to 1."""
+    less = np.less(base, 1)
+    return np.where(less, base * (1 - base**count) / np.where(less, 1 - base, 1.0), count)
 
 
 def screened(observer: ObserverData, y: ArrayLike, u: ArrayLike, held: Held | None = None) -> Screened:

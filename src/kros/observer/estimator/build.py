@@ -235,6 +235,7 @@ def assembled(
         gate=np.full(len(at), np.inf),
         opening=np.zeros(len(at)),
         deviations=np.zeros(len(at)),
+        persistence=design.recordings.persistence,
     )
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ...core import Array, Whole, frozen
+from ...core import TINY, Array, Whole, frozen
 from ...core.linalg import qr_triangle
 from ...data import EpisodeBatch, EpisodeKey
 from .bank import Bank
@@ -46,6 +46,8 @@ class Recordings:
         Sizes of the recorded states.
     ranges : tuple of ndarray, shape (n + m,)
         Least and largest values of states and inputs.
+    persistence : ndarray, shape (m,)
+        By which factor a change of an input in a sample is followed by the next one.
     bias : ndarray, optional
         Offsets of the measured states that their sensors may have at run time, of either sign, shape (q,).
 
@@ -65,6 +67,7 @@ class Recordings:
     read: Read
     size: Array
     ranges: tuple[Array, Array]
+    persistence: Array
     bias: Array | None = None
 
     @classmethod
@@ -76,8 +79,12 @@ class Recordings:
         extents, n = [], 0
         for batch in map(read, keys):
             values, n = np.concatenate([batch.states, batch.inputs], axis=-1)[:, 0], batch.states.shape[-1]
-            extents.append((len(values), values.min(axis=0), values.max(axis=0), values[:, :n].std(axis=0)))
-        lengths, lows, highs, motions = zip(*extents, strict=True)
+            changes = np.diff(values[:, n:], axis=0)
+            alike = (changes[1:] * changes[:-1]).sum(axis=0), (changes[:-1] ** 2).sum(axis=0)
+            extents.append((len(values), values.min(axis=0), values.max(axis=0), values[:, :n].std(axis=0), *alike))
+        lengths, lows, highs, motions, products, squares = zip(*extents, strict=True)
+        slowest = np.exp(-1 / np.median(lengths))
+        persistence = np.clip(np.sum(products, axis=0) / np.maximum(np.sum(squares, axis=0), TINY), 0.0, slowest)
         low, high = np.min(lows, axis=0), np.max(highs, axis=0)
         size = np.maximum(np.abs(low), np.abs(high))[:n]
         size[size == 0] = 1.0
@@ -86,7 +93,7 @@ class Recordings:
             moved[key.unit] += float(np.sum(motion / size))
         order = sorted(range(len(keys)), key=lambda i: moved[keys[i].unit])
         ordered = tuple(keys[i] for i in order), tuple(lengths[i] for i in order)
-        return cls(*ordered, read, size, (low, high), bias)
+        return cls(*ordered, read, size, (low, high), persistence, bias)
 
     @property
     def length(self) -> float:

@@ -5,7 +5,8 @@
 
 A population is one of `judge.py`, such as ``compliant:1:401``, or a study file whose data are there. Its units are
 parted into folds, and for every variant of the settings an estimator is identified from the other units. Errors are RMS
-of the hidden states on test episodes, as recorded and with half of the measurements lost, independently and in bursts;
+of the hidden states on test episodes, as recorded, with half of the measurements lost, independently and in bursts, and
+over a start in the middle;
 the table has their ratios to the defaults, geometric means over states and units. A result is one JSON file for each
 population and variant; one that is there is not made again.
 """
@@ -33,7 +34,7 @@ from kros.observer import EstimatorSettings, Recordings, identify_estimator, run
 from kros.study import Stage, load_config
 
 POPULATIONS = ("stiff:1:401", "soft:3:401", "compliant:1:401", "dc:1:401", "stiff:1:403:cut")
-FOLDS, BURST = 2, 50  # folds of three that are judged; mean samples of a burst
+FOLDS, BURST, START = 2, 50, 100  # folds of three that are judged; mean samples of a burst; those of a start
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "delays alone": {"margin": 1e6},
@@ -46,22 +47,23 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "last_lag = 0.4": {"last_lag": 0.4},
     "last_lag = 0.03": {"last_lag": 0.03},
     "start = []": {"start": ()},
+    "start_share = 1e-6": {"start_share": 1e-6},
     "restart_share = 1": {"restart_share": 1.0},
-    "restart_share = 0.01": {"restart_share": 0.01},
-    "settled_share = 0.001": {"settled_share": 1e-3},
+    "restart_share = 1e-6": {"restart_share": 1e-6},
+    "settled_share = 1e-6": {"settled_share": 1e-6},
+    "start_rows = 0": {"start_rows": 0.0},
     "nonlinear_trust = 0": {"nonlinear_trust": 0.0},
-    "gap_share = 0": {"gap_share": 0.0},
-    "restart_share = 1e-5": {"restart_share": 1e-5},
     "beyond = 0": {"beyond": 0.0},
     "penalties = [1e-16]": {"penalties": (1e-16,)},
     "parts = 1": {"parts": 1},
     "loss = 0.001": {"loss": 0.001},
     "loss = 0.1": {"loss": 0.1},
     "measured_loss = 1": {"measured_loss": 1.0},
-    "one half": {"halves": (1.0,)},
-    "reach = 10": {"reach": 10.0},
+    "halves = [0.1]": {"halves": (0.1,)},
+    "gate = 1e6": {"gate": 1e6},
     "room = 10": {"room": 10.0},
     "gap_samples = 60000": {"gap_samples": 60_000},
+    "gap_episodes = 8": {"gap_episodes": 8},
     "rows = 20000": {"rows": 20_000},
     "sample = 3000": {"sample": 3000},
 }
@@ -125,7 +127,7 @@ def judged(
         settings=EstimatorSettings(**settings),
     )
     hidden = [i for i in range(len(population.states)) if i not in measured]
-    found: dict[str, list[list[float]]] = {"recorded": [], "lost": [], "bursts": []}
+    found: dict[str, list[list[float]]] = {"recorded": [], "lost": [], "bursts": [], "started": []}
     keys = [k for split in split_episodes(population.select(held), test).values() for k in split.test]
     for number, key in enumerate(keys):
         batch, rng = EpisodeBatch.read(population, [key]), np.random.default_rng(number)
@@ -135,13 +137,20 @@ def judged(
             some = y.copy()
             some[1:][np.asarray(lost[1:], dtype=bool)] = np.nan
             estimate = run_observer(identified.observer, some, batch.inputs)[..., hidden]
-            square = np.mean((estimate - batch.states[..., hidden]) ** 2, axis=(0, 1))
-            found[part].append(np.log(np.sqrt(square)).tolist())
+            found[part].append(log_rms(estimate - batch.states[..., hidden]))
+        some = slice(len(y) // 2, len(y) // 2 + START)
+        estimate = run_observer(identified.observer, y[some], batch.inputs[some])[..., hidden]
+        found["started"].append(log_rms(estimate - batch.states[some][..., hidden]))
     return found
 
 
+def log_rms(errors: np.ndarray) -> list[float]:
+    """Return the logarithms of the RMS of errors (n_samples, batch, n)."""
+    return (np.log(np.mean(errors**2, axis=(0, 1))) / 2).tolist()
+
+
 def table(out: Path) -> str:
-    """Return ratios to the defaults as a table in Markdown: as recorded, half lost, half lost in bursts."""
+    """Return ratios to the defaults as a table in Markdown: as recorded, half lost, half in bursts, over a start."""
     names = [path.name for path in sorted(out.iterdir()) if (path / "default.json").exists()]
     lines = [f"| setting | {' | '.join(names)} |", f"|---|{'---|' * len(names)}"]
     for variant in VARIANTS:
@@ -150,7 +159,7 @@ def table(out: Path) -> str:
             place = out / name / f"{variant}.json"
             one, other = (read_json(p) if p.exists() else {} for p in (place, out / name / "default.json"))
             ratios = [np.exp(np.mean(np.subtract(one[part], other[part]))) for part in one]
-            cells.append(", ".join(f"{ratio:.2f}" for ratio in ratios))
+            cells.append("/".join(f"{ratio:.2f}" for ratio in ratios))
         lines.append(f"| {variant} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

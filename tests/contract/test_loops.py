@@ -61,9 +61,8 @@ def machines_of(count=250, lost=True):
     rng = np.random.default_rng(0)
     y[rng.random(y.shape) < 0.02] = np.nan
     if lost:
-        u[np.repeat(rng.random(u.shape[:2]) < 2e-3, 8, axis=0)[:count]] = (
-            np.nan
-        )  # longer than inputs are held: a new start
+        # longer than inputs are held: a new start
+        u[np.repeat(rng.random(u.shape[:2]) < 2e-3, 8, axis=0)[:count]] = np.nan
     else:
         y[0, ::2], y[0, 1::2], u = 0.0, np.nan, np.where(np.isfinite(u), u, 0.0)  # compiled, gaps too
         y[rng.random(y.shape) < 0.03] += 8.0

@@ -96,9 +96,8 @@ def test_exact_recordings_give_the_exact_system_and_its_shift() -> None:
     models = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
     np.testing.assert_allclose(rows(models), W, atol=1e-6)
     shift = np.concatenate([models.A, models.B], axis=-1)[:, 3]
-    np.testing.assert_allclose(
-        shift, np.broadcast_to([0, 0, 0, 0, 1, 0], shift.shape), atol=1e-6
-    )  # u[-1] of the next sample is u
+    # u[-1] of the next sample is u
+    np.testing.assert_allclose(shift, np.broadcast_to([0, 0, 0, 0, 1, 0], shift.shape), atol=1e-6)
     x = population.read(keys["u0"][0])
     run = free_run(models.A[:1], models.B[:1], BILINEAR, {}, x[None, :4, :2], x[None, :, 2:])[0]
     np.testing.assert_allclose(run, x[:, :2], atol=1e-5)

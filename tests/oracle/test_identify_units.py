@@ -113,9 +113,8 @@ def test_phases_and_lags_are_those_of_the_machine(drive, factors):
     assert len(scaled) == len(one) > 1
     np.testing.assert_allclose([s.phase for s in scaled], [s.phase for s in one], rtol=1e-6)
     np.testing.assert_allclose([s.speed / factors[0] for s in scaled], [s.speed for s in one], rtol=1e-9)
-    assert abs(one[0].speed) == pytest.approx(
-        np.abs(columns[1]).max(), rel=0.01
-    )  # where units match it is the reference's
+    # where units match it is the reference's
+    assert abs(one[0].speed) == pytest.approx(np.abs(columns[1]).max(), rel=0.01)
 
 
 def test_a_constant_is_a_constant_in_any_unit():

@@ -38,9 +38,8 @@ def random_observer(rng, functions, order=3, injection=Injection.STATE) -> Obser
 def test_a_scalar_error_shrinks_by_hand(a: float, b: float) -> None:
     found = relift_certificate(scalar(a, b))
     assert found.certified
-    assert found.gain == pytest.approx(
-        1 / (1 - abs(a) - abs(b)), rel=5e-3
-    )  # a constant residual, slopes at the corner of the sign of a
+    # a constant residual, slopes at the corner of the sign of a
+    assert found.gain == pytest.approx(1 / (1 - abs(a) - abs(b)), rel=5e-3)
     # Alone from rest, |r+| <= (|a| + |b|) |r| + |b| |q|.
     mismatch = proven_gain(error_system(scalar(a, b)).mismatch())
     assert mismatch == pytest.approx(abs(b) / (1 - abs(a) - abs(b)), rel=5e-3)

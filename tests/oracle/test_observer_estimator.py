@@ -343,6 +343,13 @@ def test_an_input_that_is_lost_goes_on_with_its_change_and_starts_nothing_anew(m
     assert wanted.shape[-1] == len(observer.recorded) < observer.lifting.n_states
 
 
+def test_measurements_are_believed_however_far_the_estimate_from_inputs_is(motors):
+    observer, batch = motors
+    narrow = replace(observer, bank=replace(observer.bank, reach=0.3 * observer.bank.reach))
+    runs = (run_observer(one, batch.measurements((0,)), batch.inputs) for one in (observer, narrow))
+    np.testing.assert_array_equal(*runs)
+
+
 def test_how_changes_of_inputs_last_is_estimated():
     changes = lfilter([1], [1, -0.9], np.random.default_rng(0).normal(size=(4, 5000)))
     inputs = {"a": [np.stack([c, np.cumsum(c), np.arange(5000.0)], axis=1) for c in changes]}

@@ -154,9 +154,8 @@ def test_one_machine_and_a_batch_judge_alike(kind, delay, fault):
         found, status = single(o, bad_y, bad_u)
         both = run_observer(o, np.concatenate([y, bad_y], axis=1), np.concatenate([u, bad_u], axis=1))
         np.testing.assert_allclose(both[:, 1], found, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(
-            both[:, 0], run_observer(o, y, u)[:, 0], rtol=1e-9, atol=1e-12
-        )  # the other machine of the batch does not notice
+        # the other machine of the batch does not notice
+        np.testing.assert_allclose(both[:, 0], run_observer(o, y, u)[:, 0], rtol=1e-9, atol=1e-12)
         own = screened(o, bad_y, bad_u).status[:, 0]
         assert all(SampleStatus(int(b)) in s for b, s in zip(own, status, strict=True))
 
@@ -202,9 +201,8 @@ def test_what_lies_within_one_and_a_half_times_the_range_is_believed():
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(o, missing, u))
     assert np.flatnonzero(screened(o, y, u).status).tolist() == [20]
     assert not screened(replace(o, seen=None), 1e6 * y, u).status.any()
-    zero = replace(
-        o, seen=Seen(np.array([2.0]), np.array([0.0, 1.0]))
-    )  # nothing is known of an input that never was anything but zero
+    # nothing is known of an input that never was anything but zero
+    zero = replace(o, seen=Seen(np.array([2.0]), np.array([0.0, 1.0])))
     assert not screened(zero, np.clip(y, -1, 1), u).status.any()
 
 

@@ -40,9 +40,8 @@ def test_filtered_estimate_of_a_kalman_predictor_is_the_kalman_filter():
     for k in range(len(y)):
         np.testing.assert_allclose(running.filter(y[k, 0]), filtered[k, 0], atol=1e-9)
         running.step(y[k, 0], u[k, 0])
-    np.testing.assert_allclose(
-        x[1:], filtered[:-1] @ F.T + u[:-1] @ G.T, atol=1e-9
-    )  # predicting from the filtered state is the prediction
+    # predicting from the filtered state is the prediction
+    np.testing.assert_allclose(x[1:], filtered[:-1] @ F.T + u[:-1] @ G.T, atol=1e-9)
 
 
 def test_a_late_measurement_of_an_exact_model_costs_nothing():

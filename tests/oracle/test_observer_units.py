@@ -59,9 +59,8 @@ def test_a_filter_bank_bridges_gaps_in_any_units():
     phase = {"phase": np.zeros(3)}
     found = run_observer(in_sizes(one, sizes), y / sizes["position"], u / [sizes["target"], sizes["rate"]], phase)
     wanted = run_observer(one, y, u, phase)[..., :3]
-    np.testing.assert_allclose(
-        found[..., :3] * [0.01, 60.0, 3e3], wanted, rtol=1e-9, atol=1e-8
-    )  # slopes of a gear magnify rounding
+    # slopes of a gear magnify rounding
+    np.testing.assert_allclose(found[..., :3] * [0.01, 60.0, 3e3], wanted, rtol=1e-9, atol=1e-8)
 
 
 def test_the_certificate_says_the_same_in_other_sizes():

@@ -29,9 +29,8 @@ def test_static_residuals() -> None:
     found = static()
     assert found.entries == pytest.approx(np.abs(DELTAS)[:, None] * np.ones((1, len(FREQS), 1, 1)))
     assert found.ratio[:, 0] == pytest.approx([0.0, 1.0, 2 / 3, 3.0])
-    assert found.largest[0] == pytest.approx(
-        np.array([[0.3, 0.2], [0.2, 0.1]])
-    )  # without the unit that need not be covered
+    # without the unit that need not be covered
+    assert found.largest[0] == pytest.approx(np.array([[0.3, 0.2], [0.2, 0.1]]))
     assert found.entry_weights == pytest.approx(found.largest, rel=1e-6)
     assert np.all(found.entry_weights >= found.largest)
     assert not found.entry_orders.any()

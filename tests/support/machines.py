@@ -82,7 +82,7 @@ def filters(functions=GEAR, cut=False, measured=(0,)):
     start[:, others] = 0.0  # states that are not measured are not known
     q = len(measured)
     doubt, half = np.array([[0.02, 0.01], [0.01, 0.03]]), np.array([0.1, 0.05, 0.2])
-    rows = [0.5, 0.8], [0.02, 0.03], [0.1, 0.2], [1.0, 2.0], [2.0, 5.0], [3.0, 4.0]
+    rows = [0.2, 0.3], [0.02, 0.03], [0.1, 0.2], [1.0, 2.0], [2.0, 5.0], [3.0, 4.0]
     of_measurements = (np.array(row[:q]) for row in rows)
     bank = FilterBank(2, start, np.array([0.95]), doubt, half, *of_measurements, np.array([0.99, 0.6]))
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, q)), np.zeros((p, 0)), np.zeros((p, q)), DT)

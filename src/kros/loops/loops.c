@@ -72,7 +72,7 @@ typedef struct {
     const double *half;       /* (recorded) */
     const double *recovery;   /* (1) */
     const double *doubt;      /* (filters, filters): covariance at a start */
-    double *gap;              /* (4 q + 1 + (filters + q)^2, batch): counts of refused and believed, widths of gates, unrest, age of the last start, covariance; moved on */
+    double *gap;              /* (5 q + 1 + (filters + q)^2, batch): counts of refused and believed, widths of gates, unrest, drift, age of the last start, covariance; moved on */
     double *states;           /* (samples, n, batch): x before every sample; none */
 } relift_job;
 
@@ -236,13 +236,15 @@ static int any(mask where) { int64_t some = 0; for (whole b = 0; b < WIDE; b++) 
 
 static vec clipped(vec value, vec low, vec high) { return either(value < low, low, either(value > high, high, value)); }
 
+static vec within_reach(vec x, vec near, double reach) { return near + clipped(x - near, (vec){0} - reach, (vec){0} + reach); }
+
 static vec root(vec x) { for (whole b = 0; b < WIDE; b++) x[b] = x[b] > 0.0 ? sqrt(x[b]) : 0.0; return x; }
 
 #define OLDEST (0.1 * exp(5.0)) /* age of a start; twice as much until a sample has all measurements */
 
 /* Gaps of a filter bank, see kros.observer.filter_bank for the symbols. */
 struct gaps {
-    vec *gap;          /* (4 q + 1): as in the job, */
+    vec *gap;          /* (5 q + 1): as in the job, */
     vec *spread;       /* (MOST, filters + q, filters + q): and the covariance */
     vec *by;           /* (recorded + filters, q): slopes by the measurements */
     vec *moved;        /* (recorded + filters, filters + q): T P */
@@ -257,7 +259,7 @@ static void fill(const relift_job *s, const struct gaps *g, vec *reg, vec *y, wh
 {
     const whole r = s->filters, q = s->q, recorded = s->recorded, size = r + q;
     for (whole v = 0; v < w; v++) {
-        vec *start = g->gap + 4 * q * MOST + v, *spread = g->spread + v * size * size, column[size];
+        vec *start = g->gap + 5 * q * MOST + v, *spread = g->spread + v * size * size, column[size];
         mask waits = *start > OLDEST, anew = {0}, complete = ~anew;
         for (whole j = 0; j < q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
@@ -304,8 +306,10 @@ static void fill(const relift_job *s, const struct gaps *g, vec *reg, vec *y, wh
         }
         for (whole j = 0; j < q; j++) {
             const whole i = s->measured[j] * MOST + v, row = j * MOST + v;
-            const vec fallback = reg[(n - recorded) * MOST + i], reach = (vec){0} + s->reach[j];
-            reg[i] = y[row] = either(g->missing[row], fallback + clipped(reg[i] - fallback, -reach, reach), y[row]);
+            vec *drift = g->gap + 4 * q * MOST + row;
+            const vec fallback = reg[(n - recorded) * MOST + i];
+            *drift = either(g->missing[row], *drift, y[row] - fallback);
+            reg[i] = y[row] = either(g->missing[row], within_reach(reg[i], fallback + *drift, s->reach[j]), y[row]);
         }
     }
 }
@@ -315,7 +319,7 @@ static void restart(const relift_job *s, const formulas *f, const struct gaps *g
 {
     const whole columns = f->n_lifted + f->n_inputs, q = s->q, size = s->filters + q;
     for (whole v = 0; v < w; v++) {
-        vec *start = g->gap + 4 * q * MOST + v, *spread = g->spread + v * size * size;
+        vec *start = g->gap + 5 * q * MOST + v, *spread = g->spread + v * size * size;
         mask begins = *start > OLDEST;
         for (whole j = 0; j < q; j++) begins &= ~g->missing[j * MOST + v];
         if (!any(begins)) continue;
@@ -390,7 +394,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
 {
     const whole q = s->q, recorded = s->recorded;
     for (whole v = 0; v < w; v++) {
-        vec *start = g->gap + 4 * q * MOST + v, variance[recorded];
+        vec *start = g->gap + 5 * q * MOST + v, variance[recorded];
         const mask waits = *start > OLDEST;
         const vec age = *start * *start, begun = age / (1.0 + age);
         const int uncertain = spread_on(f, reg, s, g, variance, columns, v);
@@ -405,7 +409,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
             const vec fallback = next[(n - recorded) * MOST + at];
             next[at] += either(waits, (vec){0} + 1.0, weight) * (fallback - next[at]);
             for (whole j = 0; j < q; j++)
-                if (s->measured[j] == i) next[at] = fallback + clipped(next[at] - fallback, (vec){0} - s->reach[j], (vec){0} + s->reach[j]);
+                if (s->measured[j] == i) next[at] = within_reach(next[at], fallback + g->gap[(4 * q + j) * MOST + v], s->reach[j]);
             next[(n - 2 * recorded) * MOST + at] = uncertain ? root(variance[i]) : (vec){0};
         }
         for (whole j = 0; j < q; j++) g->gap[(q + j) * MOST + v] += either(g->missing[j * MOST + v], (vec){0}, (vec){0} + 1.0);
@@ -416,7 +420,7 @@ static void follow(const formulas *f, const vec *reg, const relift_job *s, const
 int kros_relift(const formulas *f, const relift_job *s)
 {
     const whole n = f->n, ne = f->earlier, m = f->m, q = s->q, order = s->order, batch = s->batch, rows = n + order;
-    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, size = s->filters + q, ages = recorded ? 4 * q + 1 : 0, known = recorded ? recorded + s->filters : 0;
+    const whole columns = f->n_lifted + order + f->n_inputs + q, recorded = s->recorded, size = s->filters + q, ages = recorded ? 5 * q + 1 : 0, known = recorded ? recorded + s->filters : 0;
     struct gaps g = {vectors(ages), vectors(recorded ? size * size : 0), room(known * q * (whole)sizeof(vec)), room(known * size * (whole)sizeof(vec)), room(known * s->filters * (whole)sizeof(whole)), room(known * (whole)sizeof(whole)), (mask *)vectors(q)};
     vec *reg = vectors(f->registers), *c = vectors(order), *y = vectors(q), *next = vectors(rows), *older = vectors(ne);
     vec *each = s->own ? vectors(rows * columns) : NULL;

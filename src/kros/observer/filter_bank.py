@@ -26,9 +26,10 @@ Of states that are not measured, what follows from z is blended with the fallbac
 .. math:: x + m (x^u - x), \qquad m = v / (v + h^2),
 
 v the variance of the estimate by P; h is chosen in training, and limits of the estimates hold before. Estimates of
-measurements are within a reach of the fallback, and P stays as it is where a missing one is not known within this
-reach, so that z is bounded for any pattern of losses, whatever the model is (B. D. O. Anderson and J. B. Moore, Optimal
-Filtering, 1979; B. Sinopoli et al., IEEE Trans. Autom. Control 49 (2004) 1453-1464).
+measurements are within a reach of the fallback, less its error at the last one that was believed, since inputs alone
+say little of where an integrating machine is. P stays as it is where a missing one is not known within this reach. So z
+is bounded for any pattern of losses, whatever the model is (B. D. O. Anderson and J. B. Moore, Optimal Filtering, 1979;
+B. Sinopoli et al., IEEE Trans. Autom. Control 49 (2004) 1453-1464).
 
 After a start where nothing has moved before, :math:`x + m (x^s - x)` takes the place of x, :math:`m = a^2 / (1 +
 a^2)`, with an age a that begins at :math:`0.1 e^5` and falls by a factor a sample. The first step decides: where its
@@ -110,14 +111,14 @@ class Gaps:
         self.errors, self.from_inputs = slice(n - 2 * recorded, n - recorded), slice(n - recorded, n)
         self._from_filters = A[: self.filters.stop, self.filters]
         self.hidden = ~np.isin(np.arange(recorded), self.measured)
-        self.take(np.zeros((4 * len(measured) + 1 + (bank.filters + len(measured)) ** 2, batch)))
+        self.take(np.zeros((5 * len(measured) + 1 + (bank.filters + len(measured)) ** 2, batch)))
 
     def take(self, state: Array) -> None:
-        """Go on from a state: refused and believed measurements, gates, age of the last start, and covariance."""
+        """Go on from a state: refused and believed measurements, gates, drift, age of the last start, covariance."""
         q = len(self.measured)
         self.state = state
-        self.refusals, self.believed, self.width, self.unrest, self.start, spread = np.split(
-            state.T, np.cumsum([q, q, q, q, 1]), axis=1
+        self.refusals, self.believed, self.width, self.unrest, self.drift, self.start, spread = np.split(
+            state.T, np.cumsum([q, q, q, q, q, 1]), axis=1
         )
         self.spread = spread.reshape(len(spread), q + self.bank.filters, -1)
 
@@ -171,11 +172,13 @@ class Gaps:
             spread[arrived, r + j], spread[arrived, :, r + j] = 0.0, 0.0
             spread[lost, r + j, r + j] += variance
         fallback = x[:, self.from_inputs][:, self.measured]
+        self.drift[...] = np.where(missing, self.drift, y - fallback)
         x[:, self.measured] = np.where(missing, self._within_reach(expected, fallback), y)
 
     def _within_reach(self, expected: Array, fallback: Array) -> Array:
-        """Return estimates of measurements, no further from the fallback than a reach."""
-        return fallback + np.clip(expected - fallback, -self.bank.reach, self.bank.reach)
+        """Return estimates of measurements, no further from the fallback, less its drift, than a reach."""
+        near = fallback + self.drift
+        return near + np.clip(expected - near, -self.bank.reach, self.bank.reach)
 
     def _settle(self, apart: Array) -> None:
         """Drop the doubt of machines whose first step is as if nothing has moved before, and age others."""

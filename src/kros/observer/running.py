@@ -131,8 +131,8 @@ class RunningObserver:
             NaN, or infinite, where a measurement is missing or too old: it corrects nothing at this step. None where
             all are missing.
         u : array_like, shape (m,)
-            Not finite where it is not known, or None: the last good value stands for it, for five samples with its
-            slope, zero before the first. What is implausible: see `screen`.
+            Not finite where it is not known, or None: the last good value and its change stand for it, zero before the
+            first. What is implausible: see `screen`.
 
         Returns
         -------

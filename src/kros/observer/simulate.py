@@ -32,8 +32,8 @@ def run_observer(
     y : ndarray, shape (n_samples, batch, q)
         Row k is what arrives at k; NaN or infinite where a measurement is missing, which then corrects nothing.
     u : ndarray, shape (n_samples, batch, m)
-        Not finite where an input is not known: the last good value stands for it. What is implausible, and where a run
-        starts: see `screen`.
+        Not finite where an input is not known: its last good value and change stand for it. What is implausible, and
+        where a run starts: see `screen`.
     parameters : mapping of str to array_like, shape (batch,)
         Lifting parameters of the machine behind each episode; the observer's own where absent.
 

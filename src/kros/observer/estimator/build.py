@@ -219,7 +219,7 @@ def assembled(
     ):
         model[rows[:, None], states], model[rows[:, None], inputs_of], start[rows[:, None], inputs_of] = system
     held = [at[i] for i in without.held]
-    model[u[held], held] = 1.0
+    model[u[held], held] = start[u[held], held] = 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     low, high = (end[at] for end in design.recordings.ranges)

@@ -331,8 +331,8 @@ def test_an_input_that_is_lost_goes_on_with_its_change_and_starts_nothing_anew(m
     lost[100:150], held[100:150] = np.nan, u[99] + going_on * (u[99] - u[98])
     wanted = run_observer(observer, y, held)
     np.testing.assert_allclose(run_observer(observer, y, lost), wanted, atol=1e-9 * np.abs(wanted).max())
-    moved = y + np.where(np.arange(len(y)) == 120, 2 * observer.bank.gate, 0.0)[:, None, None]
-    refused = [run_with_status(observer, moved, each)[1][120] & SampleStatus.LIMIT > 0 for each in (lost, u)]
+    moved = y + np.where(np.arange(len(y)) == 100, 2 * observer.bank.gate, 0.0)[:, None, None]
+    refused = [run_with_status(observer, moved, each)[1][100] & SampleStatus.LIMIT > 0 for each in (lost, u)]
     assert not refused[0].any()  # the input may be wrong
     assert refused[1].all()
     running = observer.start(y[0, 0])

@@ -43,9 +43,9 @@ b the gate, k the measurements that were believed since a start, r those that we
 before these. v is the largest r after which one was believed, and is forgotten as a start is: where measurements are
 worse than in training, gates are wider. After as many refused in a row as were believed, less v, or as a start takes,
 any measurement is believed. One that is believed after refusals, and is further away than P says by then, is a start:
-what was known is of no use. The filters z start again, if all measurements are there, and those of inputs go on. While
-an input is not known, k is zero. At a start without all measurements, inputs alone count until the first sample that
-has them; there the filters z start.
+what was known is of no use. The filters z start again, if all measurements are there, and those of inputs go on. Where
+an input is not known beside a measurement, or for more than five samples, k is zero. At a start without all
+measurements, inputs alone count until the first sample that has them; there the filters z start.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ class Screened:
     u: Array  # (n_samples, batch, m)
     status: Bits  # (n_samples, batch)
     starts: Flags  # (n_samples, batch)
-    unsure: Flags  # (n_samples, batch); An input was lost more than a few samples ago
+    unsure: Flags  # (n_samples, batch); An input is not known beside a measurement, or for more than a few samples
     complete: Flags  # (n_samples, batch); An observer may start at them
     held: Held
 
@@ -166,7 +166,8 @@ class Screen:
         complete = np.asarray(good.all(axis=-1) & self.enough(plausible[..., :q]))
         starts, stale = _starts(lost, complete, before.stale)
         y = np.where(plausible, within, np.nan)[..., :q]
-        unsure = np.asarray((since > LONGEST).any(axis=-1))
+        few = np.where(np.isfinite(y).any(axis=-1, keepdims=True), 0, LONGEST)
+        unsure = np.asarray((since > few).any(axis=-1))
         return Screened(y, inputs, status, starts, unsure, complete, Held(last[-1], slopes[-1], since[-1], stale))
 
 

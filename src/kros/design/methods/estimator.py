@@ -30,7 +30,7 @@ class Estimator(Method):
         poles = np.linalg.eigvals(models.A[models.index(task.unit)]).tolist()
         identified = identify_estimator(task.name, *channels, recordings, *settings, poles)
         observer = identified.observer
-        start = np.pad(training.runtime.first(len(observer.recorded)), (0, observer.internal))
+        start = np.pad(task.training.runtime.first(len(observer.recorded)), (0, observer.internal))
         runtime = replace(observer.runtime, start=start)
         observer = replace(observer, seen=self._seen(task), sensor=training.sensor, runtime=runtime)
         synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection)

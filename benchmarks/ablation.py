@@ -6,9 +6,8 @@
 A population is one of `judge.py`, such as ``compliant:1:401``, or a study file whose data are there. Its units are
 parted into folds, and for every variant of the settings an estimator is identified from the other units. Errors are RMS
 of the hidden states on test episodes, as recorded, with half of the measurements lost, independently and in bursts, and
-over a start in the middle;
-the table has their ratios to the defaults, geometric means over states and units. A result is one JSON file for each
-population and variant; one that is there is not made again.
+over a start in the middle; the table has their ratios to the defaults, geometric means over states and units. A result
+is one JSON file for each population and variant; one that is there is not made again.
 """
 
 from __future__ import annotations

@@ -77,9 +77,8 @@ class FilterBank:
     persistence: Array  # (m,), by which factor a change of an input is followed by the next one
 
     def __post_init__(self) -> None:
-        floats(self, "Filter bank", start="finite numbers", recovery="shares between 0 and 1", rest="positive")
-        floats(self, "Filter bank", persistence="shares between 0 and 1")
-        floats(self, "Filter bank", gate="positive")
+        floats(self, "Filter bank", recovery="shares between 0 and 1", persistence="shares between 0 and 1")
+        floats(self, "Filter bank", start="finite numbers", rest="positive", gate="positive")
         floats(self, "Filter bank", half="positive and finite", noise="positive and finite")
         floats(self, "Filter bank", reach="finite and not negative", opening="finite and not negative")
         floats(self, "Filter bank", doubt="finite numbers", deviations="finite and not negative")
@@ -176,7 +175,7 @@ class Gaps:
         x[:, self.measured] = np.where(missing, self._within_reach(expected, fallback), y)
 
     def _within_reach(self, expected: Array, fallback: Array) -> Array:
-        """Return estimates of measurements, no further from the fallback, less its drift, than a reach."""
+        """Return estimates of measurements, no further from the fallback, moved by its drift, than a reach."""
         near = fallback + self.drift
         return near + np.clip(expected - near, -self.bank.reach, self.bank.reach)
 

@@ -160,19 +160,19 @@ class Screen:
         earlier, ago = (np.concatenate([b[None], v[:-1]]) for b, v in ((before.inputs, last), (before.since, since)))
         changes = (last - earlier) / (ago + 1) * (ago <= self.longest)
         slopes = np.take_along_axis(np.concatenate([before.slopes[None], changes]), latest, axis=0)
-        lasting = powers(self.persistence, np.minimum(since, self.longest))
+        lasting = sum_of_powers(self.persistence, np.minimum(since, self.longest))
         inputs = np.clip(last + slopes * lasting, self.least[q:], self.most[q:])
         lost = np.asarray((since > self.longest).any(axis=-1))
         complete = np.asarray(good.all(axis=-1) & self.enough(plausible[..., :q]))
         starts, stale = _starts(lost, complete, before.stale)
         y = np.where(plausible, within, np.nan)[..., :q]
-        few = np.where(np.isfinite(y).any(axis=-1, keepdims=True), 0, LONGEST)
-        unsure = np.asarray((since > few).any(axis=-1))
+        allowed = np.where(np.isfinite(y).any(axis=-1, keepdims=True), 0, LONGEST)
+        unsure = np.asarray((since > allowed).any(axis=-1))
         return Screened(y, inputs, status, starts, unsure, complete, Held(last[-1], slopes[-1], since[-1], stale))
 
 
-def powers(base: float | Array, count: Index) -> Array:
-    """Return the sum of the first powers of a number from 0 to 1."""
+def sum_of_powers(base: float | Array, count: Index) -> Array:
+    """Return ``base + base^2 + ...``, so many terms, for a base from 0 to 1."""
     less = np.less(base, 1)
     return np.where(less, base * (1 - base**count) / np.where(less, 1 - base, 1.0), count)
 

@@ -22,9 +22,9 @@ class Estimator(Method):
 
     def design(self, task: DesignTask) -> Design:
         """Identify the estimator."""
-        models, training = task.models, task.recordings
-        bias = np.array([training.sensor.get(models.lifting.states[i], Sensor()).bias for i in models.measured])
-        recordings = Recordings.of(training.keys, training.read_one, bias)
+        models, whole = task.models, task.recordings
+        bias = np.array([whole.sensor.get(models.lifting.states[i], Sensor()).bias for i in models.measured])
+        recordings = Recordings.of(whole.keys, whole.read_one, bias)
         channels = models.lifting, models.measured, models.recorded_inputs
         settings = models.sample_period_s, models.parameters_of(task.unit), self.settings
         poles = np.linalg.eigvals(models.A[models.index(task.unit)]).tolist()
@@ -32,7 +32,7 @@ class Estimator(Method):
         observer = identified.observer
         start = np.pad(task.training.runtime.first(len(observer.recorded)), (0, observer.internal))
         runtime = replace(observer.runtime, start=start)
-        observer = replace(observer, seen=self._seen(task), sensor=training.sensor, runtime=runtime)
+        observer = replace(observer, seen=self._seen(task), sensor=whole.sensor, runtime=runtime)
         synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection)
         return Design(task.name, observer, synthesis, identified.facts)
 

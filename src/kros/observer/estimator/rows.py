@@ -80,8 +80,9 @@ class Recordings:
         for batch in map(read, keys):
             values, n = np.concatenate([batch.states, batch.inputs], axis=-1)[:, 0], batch.states.shape[-1]
             changes = np.diff(values[:, n:], axis=0)
-            alike = (changes[1:] * changes[:-1]).sum(axis=0), (changes[:-1] ** 2).sum(axis=0)
-            extents.append((len(values), values.min(axis=0), values.max(axis=0), values[:, :n].std(axis=0), *alike))
+            correlated = (changes[1:] * changes[:-1]).sum(axis=0), (changes[:-1] ** 2).sum(axis=0)
+            motion = values[:, :n].std(axis=0)
+            extents.append((len(values), values.min(axis=0), values.max(axis=0), motion, *correlated))
         lengths, lows, highs, motions, products, squares = zip(*extents, strict=True)
         slowest = np.exp(-1 / np.median(lengths))
         persistence = np.clip(np.sum(products, axis=0) / np.maximum(np.sum(squares, axis=0), TINY), 0.0, slowest)
